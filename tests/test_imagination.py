@@ -35,8 +35,7 @@ from accerl_lerobot.world_model.config import (
     OnlineLearnConfig,
     PixelModelConfig,
 )
-from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
-from accerl_lerobot.world_model.data import load_episodes
+from accerl_lerobot.world_model.contract import WorldModelSpec, load_episodes, new_model
 from accerl_lerobot.world_model.imagined import World, check_imagination, load_world, read_content, save_world
 from accerl_lerobot.world_model.online import ONLINE, make_learner
 from tests.policies.checkpoints import write_diffusion

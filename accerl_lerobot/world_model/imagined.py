@@ -39,18 +39,16 @@ from accerl_lerobot.policies.untrusted import Unfilled, input_error
 from accerl_lerobot.rollout.runner import Starts, start_of
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
+    Episode,
     LearnableWorldModel,
     Prediction,
     State,
-    WorldModelSpec,
-    new_model,
-)
-from accerl_lerobot.world_model.data import (
-    Episode,
     WindowStart,
+    WorldModelSpec,
     check_dataset,
     cut_windows,
     model_arrays,
+    new_model,
     resize,
 )
 from accerl_lerobot.world_model.pixels import SuccessModel

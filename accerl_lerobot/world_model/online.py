@@ -26,8 +26,7 @@ from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.world_model.config import WORLD_LEARNING, OnlineLearnConfig
-from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.data import Episode, load_episodes, model_arrays
+from accerl_lerobot.world_model.contract import Episode, WorldModelSpec, load_episodes, model_arrays
 from accerl_lerobot.world_model.imagined import LEARN, World, read_content, save_world, world_of, world_path
 from accerl_lerobot.world_model.training import Trainer, uniform
 

@@ -42,12 +42,15 @@ from accerl_lerobot.evaluation import write_video
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.contract import Windows, WorldModelSpec, new_model, replay
-from accerl_lerobot.world_model.data import (
+from accerl_lerobot.world_model.contract import (
     Episode,
+    Windows,
     WindowStart,
+    WorldModelSpec,
     cut_windows,
     load_episodes,
+    new_model,
+    replay,
     split_episodes,
 )  # fmt: skip
 from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world

@@ -21,8 +21,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.world_model.contract import Windows, replay
-from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
+from accerl_lerobot.world_model.contract import Episode, Windows, WindowStart, cut_windows, replay
 from accerl_lerobot.world_model.imagined import World
 
 BATCH = 16  # windows per gradient step

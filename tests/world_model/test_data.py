@@ -15,9 +15,16 @@ from torch import Tensor
 from accerl_lerobot.engines.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import data
-from accerl_lerobot.world_model.contract import Windows, WorldModelSpec
-from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows, load_episodes, split_episodes
+from accerl_lerobot.world_model import contract
+from accerl_lerobot.world_model.contract import (
+    Episode,
+    Windows,
+    WindowStart,
+    WorldModelSpec,
+    cut_windows,
+    load_episodes,
+    split_episodes,
+)
 from tests.tiny_datasets import record_dataset
 
 K = 3
@@ -156,6 +163,6 @@ def test_what_cannot_be_learned_from(changes: dict[str, Any], why: str, monkeypa
         shapes[name] = shape
     features = {name: {"shape": shape} for name, shape in shapes.items() if isinstance(shape, tuple)}
     meta = SimpleNamespace(features=features, fps=fps, camera_keys=[])
-    monkeypatch.setattr(data, "open_metadata", lambda dataset: meta)
+    monkeypatch.setattr(contract, "open_metadata", lambda dataset: meta)
     with pytest.raises(InputError, match=f"^other.repo_id='a/b': {why}"):
-        data.check_dataset(DatasetConfig(repo_id="a/b"), SPEC, "other")
+        contract.check_dataset(DatasetConfig(repo_id="a/b"), SPEC, "other")
