@@ -28,6 +28,9 @@ are raw: scaling and normalisation belong to the policy's own LeRobot processors
 Observations = dict[str, np.ndarray]
 """A batch of observations, arrays (B, ...) by the names of an `Observation`; the instructions are apart."""
 
+Tensors = dict[str, np.ndarray]
+"""Weights of the policy by the names of its parameters; dtype and shape arrive as they were sent."""
+
 Metrics = dict[str, float]
 """Numbers for the log, by name; docs/metrics.md explains them."""
 

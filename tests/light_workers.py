@@ -18,7 +18,7 @@ from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
-from accerl_lerobot.trainer.peers import LearnerSettings
+from accerl_lerobot.trainer.worker import LearnerSettings, WeightPublisher
 from accerl_lerobot.transport.connection import (
     Address,
     Server,
@@ -26,7 +26,6 @@ from accerl_lerobot.transport.connection import (
     node_address,
     serve_on_loop,
 )
-from accerl_lerobot.transport.weights import WeightPublisher
 
 HANGS = "hangs"  # a folder that whoever writes into it hangs
 FULL = "full"  # a folder that nothing can be written into

@@ -31,7 +31,7 @@ HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
 MOST_EXPRESSIONS, MOST_FILES = 66_900, 126
 ENGINE = {"ray_engine.py", "ray_session.py", "supervision.py"}
-SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "peers.py", "connection.py"}
+SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "connection.py"}
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"ranks.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
@@ -40,7 +40,6 @@ LIGHT = [
     "accerl_lerobot.algorithms", "accerl_lerobot.cli", "accerl_lerobot.demos.record", "accerl_lerobot.envs",
     "accerl_lerobot.experience", "accerl_lerobot.inference.batcher", "accerl_lerobot.replay.worker",
     "accerl_lerobot.rollout.worker", "accerl_lerobot.timeline", "accerl_lerobot.algorithms.config",
-    "accerl_lerobot.transport.weights",
 ]  # fmt: skip
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 

@@ -204,8 +204,7 @@ class RayEngine(Engine):
         from accerl_lerobot.inference.worker import InferenceWorker
         from accerl_lerobot.replay.worker import ReplayWorker
         from accerl_lerobot.rollout.worker import RolloutWorker
-        from accerl_lerobot.trainer.peers import SHARE, LearnerSettings, TrainerRank
-        from accerl_lerobot.trainer.worker import TrainerWorker
+        from accerl_lerobot.trainer.worker import SHARE, LearnerSettings, TrainerRank, TrainerWorker
         from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
 
         config = self._config

@@ -29,13 +29,12 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
-from accerl_lerobot.experience import Decision, Metrics, Request
+from accerl_lerobot.experience import Decision, Metrics, Request, Tensors
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.connection import Address, PendingRequest, Server, node_address
-from accerl_lerobot.transport.weights import Tensors
 
 LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
 

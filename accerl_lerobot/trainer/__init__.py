@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One update, and the process that repeats it."""
+"""The process that makes the updates, and its other ranks."""

@@ -5,6 +5,16 @@ consumes    batches of segments from replay, the next one drawn while the curren
 produces    weights, published after each update for the replicas that ask, also after the last update
 waits for   a batch
 ends        after `updates` updates, or when replay is closed
+
+Replicas of the policy get weights from a `WeightPublisher`, through Ray's object store.
+
+The trainer may have other ranks, processes that make each update along with the first:
+
+    replay ──batch──► rank 0 ──its reference──► ranks 1, 2 …
+                        ◄── torch.distributed: values, gradients, parts of weights ──►
+
+Work of all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. A
+rank that is lost ends the wait, after `SHARE` of ``launch.stall_s`` at the latest, and with it the trainer.
 """
 
 from __future__ import annotations
@@ -13,21 +23,61 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ray
 
 from accerl_lerobot import errors
+from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.experience import Metrics, Segment
+from accerl_lerobot.experience import Metrics, Segment, Tensors
 from accerl_lerobot.fault_points import fault_point
+from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.peers import LearnerSettings, Peers
-from accerl_lerobot.transport.weights import WeightPublisher
+
+if TYPE_CHECKING:
+    from accerl_lerobot.algorithms.ratio_update import BaseUpdate
+
+LOAD_S = 600.0  # how long a rank may take to load its policy
+SHARE = 0.4
+"""Share of ``launch.stall_s`` for which a rank waits for the others, so that the trainer ends by itself."""
+FLUSH_S = 300.0  # timeout for all replicas together: a forward pass and a copy of the weights
+ASK_S = 10.0  # how long a replica's question for newer weights waits before it is answered with nothing
+
+
+class LearnerSettings(NamedTuple):
+    """How each rank makes its policy, and the updates of it."""
+
+    policy: PolicyConfig  # the checkpoint to start from
+    algorithm: AlgorithmConfig
+    trainer: TrainerConfig
+    seed: int  # seed of torch's global generator
+    state: Path | None = None  # the ``training_state`` to resume from; None: begin
+    load: Load | None = None  # makes the adapter; None: of LeRobot's checkpoint
+    timeout_s: float = 120.0  # how long a rank waits for the others within an update
+
+    def adapter(self) -> Any:
+        import torch
+
+        torch.set_num_threads(self.trainer.num_threads)
+        torch.manual_seed(self.seed)
+        return loader(self.load)(self.policy)
+
+    def begin(self, adapter: Any) -> BaseUpdate:
+        """The updates, from the state on, once all ranks have come together."""
+        from accerl_lerobot.algorithms.ratio_update import make_update
+
+        update = make_update(adapter, self.algorithm, self.trainer)
+        if self.state is not None:
+            adapter.load_trainable(snapshot.load(self.state / WEIGHTS))
+            update.restore(snapshot.load(self.state / "trainer"))
+        return update
 
 
 class TrainerWorker:
@@ -164,3 +214,144 @@ class TrainerWorker:
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
+
+
+class WeightPublisher:
+    """Keeps the newest weights for the replicas, which ask from other threads.
+
+    The trainer puts each set into Ray's object store once. A replica asks for the newest set whenever it has
+    applied the one before, so a slow replica skips versions and the trainer waits for none.
+
+    Args:
+        readers: names of the replicas that `flush` waits for.
+        put: copies tensors into the store; returns the reference that replicas get.
+    """
+
+    def __init__(self, readers: Iterable[str], put: Callable[[Tensors], Any]) -> None:
+        self._put = put
+        self._changed = threading.Condition()
+        self._applied = dict.fromkeys(readers, -1)
+        self.version = -1
+        self._reference = None
+
+    def publish(self, version: int, tensors: Tensors) -> None:
+        """Copy a set; the tensors may change afterwards."""
+        reference = self._put(tensors)
+        with self._changed:
+            self.version = version
+            self._reference = reference
+            self._changed.notify_all()
+
+    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
+        """Note that a replica has applied a version; returns the newest one and its reference.
+
+        The list is empty if there was none within `ASK_S`. Ray would replace a reference outside of a list by
+        the tensors.
+        """
+        with self._changed:
+            self._applied[reader] = version
+            self._changed.notify_all()
+            if not self._changed.wait_for(lambda: self.version > version, ASK_S):
+                return version, []
+            return self.version, [self._reference]
+
+    def flush(self, timeout_s: float = FLUSH_S) -> None:
+        """Wait until every replica has applied the newest set."""
+
+        def late() -> list[str]:
+            return [name for name, version in self._applied.items() if version < self.version]
+
+        with self._changed:
+            if not self._changed.wait_for(lambda: not late(), timeout_s):
+                raise TimeoutError(f"weights not applied within {timeout_s:g} s by {', '.join(late())}")
+
+
+class Peers:
+    """The others, as the first rank sees them: `actors` are handles of `TrainerRank`, of rank 1, 2 …."""
+
+    def __init__(self, actors: Sequence[Any], config: TrainerConfig, timeout_s: float) -> None:
+        self._actors = list(actors)
+        self._config = config
+        self._timeout_s = timeout_s
+
+    def begin(self, settings: LearnerSettings) -> BaseUpdate:
+        """Loads the first rank's policy and meets the others, once they have loaded theirs."""
+        from accerl_lerobot.algorithms import ranks
+
+        adapter = settings.adapter()
+        if not self._actors:
+            return settings.begin(adapter)
+        # Actors of one thread: by then they have loaded their policies.
+        nodes = ray.get([actor.node.remote() for actor in self._actors], timeout=LOAD_S)
+        this_node = str(ray.get_runtime_context().get_node_id())
+        address = ranks.LOOPBACK
+        if set(nodes) != {this_node}:
+            address = ray.util.get_node_ip_address()
+        ranks.use_only(address)
+        size = self._config.ranks
+        store, port = ranks.open_store(address, size, self._timeout_s)
+        with self.joining("join", address, port):
+            ranks.join(store, 0, size, adapter.device, self._timeout_s)
+            return settings.begin(adapter)
+
+    @contextmanager
+    def joining(self, method: str, *arguments: Any) -> Iterator[None]:
+        """They do `method` while the first rank does its part inside; an error of theirs is raised here."""
+        calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
+        yield
+        if calls:
+            ray.get(calls, timeout=self._timeout_s)
+
+    def gathering(self, method: str) -> AbstractContextManager[None]:
+        """As `joining`, for work of all ranks only where each keeps a part of the weights."""
+        if self._config.zero:
+            return self.joining(method)
+        return nullcontext()
+
+
+class TrainerRank:
+    """Any rank but the first; becomes a Ray actor of one thread, so that calls are done in their order."""
+
+    def __init__(self, rank: int, settings: LearnerSettings) -> None:
+        errors.collect_warnings()
+        self._rank = rank
+        self._settings = settings
+        self._adapter = settings.adapter()
+
+    def ready(self) -> int:
+        """Answers once the policy is loaded; returns this process's id."""
+        return os.getpid()
+
+    def node(self) -> str:
+        return str(ray.get_runtime_context().get_node_id())
+
+    def metrics(self) -> Metrics:
+        """Nothing: the first rank reports for all. Answering shows that it is not stuck."""
+        return {}
+
+    def join(self, address: str, port: int) -> None:
+        from accerl_lerobot.algorithms import ranks
+
+        size = self._settings.trainer.ranks
+        timeout_s = self._settings.timeout_s
+        own_address = address
+        if address != ranks.LOOPBACK:
+            own_address = ray.util.get_node_ip_address()
+        ranks.use_only(own_address)
+        store = ranks.store_at(address, port, size, timeout_s)
+        ranks.join(store, self._rank, size, self._adapter.device, timeout_s)
+        self._update = self._settings.begin(self._adapter)
+
+    def step(self, segments: Sequence[Segment]) -> None:
+        fault_point("rank.step")
+        self._update.step(segments)
+
+    def gather_weights(self) -> None:
+        """Its part of the trainable weights, for the first rank to export."""
+        self._adapter.export_trainable()
+
+    def gather_state(self) -> None:
+        """Its part of all that is saved, in the order in which the first rank asks for it."""
+        self._adapter.copy_weights()
+        self._adapter.export_trainable()
+        self._update.state()

@@ -19,9 +19,9 @@ from accerl_lerobot.inference.batcher import Batcher, merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.transport import weights as weights_module
+from accerl_lerobot.trainer import worker as trainer_worker
+from accerl_lerobot.trainer.worker import WeightPublisher
 from accerl_lerobot.transport.connection import Client, ServiceStoppedError
-from accerl_lerobot.transport.weights import WeightPublisher
 from tests.runs import HANGS_S
 
 NAMES = ("a", "b", "c")
@@ -134,7 +134,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
     def run(scene: Scene, adapter: CountingAdapter | None = None, **config: Any) -> Any:
         adapter = adapter or CountingAdapter()
-        monkeypatch.setattr(weights_module, "ASK_S", 0.05)
+        monkeypatch.setattr(trainer_worker, "ASK_S", 0.05)
         monkeypatch.setattr(loading, "load_adapter", lambda policy: adapter)
 
         async def main() -> Any:

@@ -11,7 +11,7 @@ import pytest
 import ray
 
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.trainer.peers import Peers
+from accerl_lerobot.trainer.worker import Peers
 
 THREE = TrainerConfig(ranks=3)
 WAIT_S = 2.0

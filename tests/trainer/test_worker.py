@@ -18,9 +18,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
-from accerl_lerobot.trainer.peers import LearnerSettings
-from accerl_lerobot.trainer.worker import TrainerWorker
-from accerl_lerobot.transport.weights import WeightPublisher
+from accerl_lerobot.trainer.worker import LearnerSettings, TrainerWorker, WeightPublisher
 from tests.algorithms.linear import LinearAdapter, make_segments
 
 
