@@ -26,7 +26,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engines import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport.connection import Client, Server
+from accerl_lerobot.transport import Client, Server
 from benchmarks.tables import as_markdown, as_table, host, named, ranged, spread, write
 
 RAY, SOCKET = "ray", "socket"

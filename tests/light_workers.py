@@ -19,13 +19,7 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.worker import LearnerSettings, WeightPublisher
-from accerl_lerobot.transport.connection import (
-    Address,
-    Server,
-    ServiceStoppedError,
-    node_address,
-    serve_on_loop,
-)
+from accerl_lerobot.transport import Address, Server, ServiceStoppedError, node_address, serve_on_loop
 
 HANGS = "hangs"  # a folder that whoever writes into it hangs
 FULL = "full"  # a folder that nothing can be written into

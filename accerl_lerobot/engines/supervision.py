@@ -28,7 +28,7 @@ from accerl_lerobot.errors import InputError, collected_warnings, last_exception
 from accerl_lerobot.experience import REAL
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, budgets, incarnation_after
 from accerl_lerobot.rollout.worker import Report
-from accerl_lerobot.transport.connection import Endpoint
+from accerl_lerobot.transport import Endpoint
 
 logger = logging.getLogger(__name__)
 

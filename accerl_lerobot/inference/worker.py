@@ -34,7 +34,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.connection import Address, PendingRequest, Server, node_address
+from accerl_lerobot.transport import Address, PendingRequest, Server, node_address
 
 LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
 

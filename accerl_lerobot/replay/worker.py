@@ -26,7 +26,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, SYNCHRONOUS, Replay, ReplayConfig, Schedule
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
-from accerl_lerobot.transport.connection import Address, Server, node_address, serve_on_loop, stopped
+from accerl_lerobot.transport import Address, Server, node_address, serve_on_loop, stopped
 
 
 class ReplayWorker:

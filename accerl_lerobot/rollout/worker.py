@@ -39,7 +39,7 @@ from accerl_lerobot.rollout.runner import (
     Starts,
 )
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.connection import Client, Endpoint, ReconnectingClient
+from accerl_lerobot.transport import Client, Endpoint, ReconnectingClient
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import ImaginationConfig

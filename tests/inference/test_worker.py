@@ -21,7 +21,7 @@ from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.worker import WeightPublisher
-from accerl_lerobot.transport.connection import Client, ServiceStoppedError
+from accerl_lerobot.transport import Client, ServiceStoppedError
 from tests.runs import HANGS_S
 
 NAMES = ("a", "b", "c")

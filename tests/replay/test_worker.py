@@ -11,7 +11,7 @@ import pytest
 
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
-from accerl_lerobot.transport.connection import ServiceStoppedError
+from accerl_lerobot.transport import ServiceStoppedError
 from tests.replay.segments import make_segment
 
 CONFIG = ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=8, samples_per_insert=1.0)

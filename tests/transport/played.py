@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
-from accerl_lerobot.transport.connection import Endpoint
+from accerl_lerobot.transport import Endpoint
 
 
 class PlayedClient:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accerl_lerobot import transport
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport import connection, weights
 from accerl_lerobot.transport.connection import (
@@ -160,7 +161,7 @@ def test_many_large_messages_of_any_size_are_under_way(service: Service):
 
 def test_no_end_waits_for_one_that_reads_nothing(monkeypatch: pytest.MonkeyPatch):
     """A message to a service that has stopped, and a reply to such a client, are kept."""
-    monkeypatch.setattr(connection, "SEND_S", 0.05)
+    monkeypatch.setattr(transport, "SEND_S", 0.05)
     requests: list[PendingRequest] = []
     server = Server(requests.append)
     client = Client("service", server.address)
@@ -255,7 +256,7 @@ def test_a_message_is_as_old_as_its_sender_says_if_that_can_be(monkeypatch: pyte
     taken.clear()
     for client in (*clients, *clients):
         client.send("now")
-    monkeypatch.setattr(connection.time, "monotonic", lambda now=time.monotonic: now() - 1e6)
+    monkeypatch.setattr(transport.time, "monotonic", lambda now=time.monotonic: now() - 1e6)
     clients[0].send("of a node that has just been started")
     monkeypatch.undo()
     while len(taken) < 5:
