@@ -50,9 +50,8 @@ from accerl_lerobot.checkpoint.layout import (
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID
-from accerl_lerobot.engines import local
+from accerl_lerobot.engines import Progress, Saved, local
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.engines.contract import Progress, Saved
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate, drawing
 from accerl_lerobot.experience import Decision, Request

@@ -18,8 +18,8 @@ from rich.table import Table
 
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
+from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.config import RunConfig, parse
-from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule

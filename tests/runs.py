@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, RatioConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.engines.contract import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.metrics import METRICS

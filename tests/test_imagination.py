@@ -21,7 +21,6 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
-from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError

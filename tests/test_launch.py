@@ -15,7 +15,6 @@ import pytest
 
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.buffer import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig

@@ -17,7 +17,7 @@ import pytest
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engines.contract import Progress
+from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.supervision import RolloutSlot, restore_rollouts, save_rollouts
 from accerl_lerobot.errors import InputError

@@ -12,8 +12,8 @@ import pytest
 from accerl_lerobot.algorithms import AlgorithmConfig, chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError

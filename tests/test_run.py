@@ -10,8 +10,8 @@ import pytest
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
+from accerl_lerobot.engines import Engine, Progress, Saved
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines import ray_engine
+from accerl_lerobot.engines import Progress, ray_engine
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker

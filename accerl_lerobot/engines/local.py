@@ -17,8 +17,8 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.engines import Engine, Progress, Saved
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Decision, Request, Segment

@@ -25,8 +25,8 @@ import ray
 from ray.exceptions import RayError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
+from accerl_lerobot.engines import Engine, Progress, Saved
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.engines.ray_session import NO_HUB_TOKEN, learns_states, place_workers, start_ray
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.engines.supervision import (

@@ -34,8 +34,8 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
+from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.engines.contract import Engine, Progress
 from accerl_lerobot.engines.stopping import Stopping
 from accerl_lerobot.errors import warn_once
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise

@@ -35,9 +35,8 @@ from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
-from accerl_lerobot.engines import ray_session
+from accerl_lerobot.engines import Engine, ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.engines.contract import Engine
 from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
 from accerl_lerobot.errors import (

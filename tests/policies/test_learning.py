@@ -16,7 +16,7 @@ import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines.contract import Engine
+from accerl_lerobot.engines import Engine
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import evaluation_plans
