@@ -20,6 +20,7 @@ from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
+from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig

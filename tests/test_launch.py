@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.buffer import ReplayConfig, lag_bound

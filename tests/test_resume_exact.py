@@ -151,22 +151,6 @@ def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
     assert max(u["ratio_max_dev"] for u in found[1:]) > 1e-3, "the weights should have moved"
 
 
-@pytest.mark.slow
-def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
-    def lags(hold_back: int) -> tuple[list[float], Progress]:
-        fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
-        trainer = TrainerConfig(**fields, hold_back=hold_back, probe_every=4)
-        launch = LaunchConfig(engine="local")
-        history, _ = trained(tiny_run(tiny_checkpoint, trainer=trainer, launch=launch))
-        assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
-        return [u["lag_mean"] for u in updates(history)], history[-1]
-
-    (prompt, end), (late, other_end) = lags(0), lags(4)
-    assert late[:1] == prompt[:1] == [0.0]
-    assert all(lag >= 4 for lag in late[5:]) and max(prompt) < 4, "samples of an acting policy 4 updates old"
-    assert end.inference["version"] == other_end.inference["version"] == 14, "the last weights act at once"
-
-
 def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Path):
     config = tiny_run(tiny_checkpoint, env=LatencyConfig(max_steps=16, nan_after=21))
     history, _ = trained(config)

@@ -14,7 +14,6 @@ import pytest
 import torch
 from PIL import Image
 
-from accerl_lerobot.algorithms.demonstrations import recorded
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
@@ -29,8 +28,8 @@ from accerl_lerobot.demos.dataset_files import (
 )
 from accerl_lerobot.demos.sft import picked
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.data import load_episodes
+from accerl_lerobot.run.adapter import recorded
+from accerl_lerobot.world_model.contract import WorldModelSpec, load_episodes
 from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels, rewrite, write_dataset
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

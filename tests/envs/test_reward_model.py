@@ -16,8 +16,13 @@ from lerobot.rewards import RewardClassifierConfig, make_reward_pre_post_process
 from lerobot.rewards.classifier.modeling_classifier import Classifier
 from transformers import ResNetConfig, ResNetModel
 
-from accerl_lerobot.envs import JudgedEnvironment, RewardModelConfig, SimulatedConfig, make_environment
-from accerl_lerobot.envs.making import load_judge
+from accerl_lerobot.envs import (
+    JudgedEnvironment,
+    RewardModelConfig,
+    SimulatedConfig,
+    load_judge,
+    make_environment,
+)
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_environment, check_start

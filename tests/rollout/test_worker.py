@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot import transport
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from accerl_lerobot import transport
-from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport import connection, weights
-from accerl_lerobot.transport.connection import (
+from accerl_lerobot.experience import Decision, Request, Tensors
+from accerl_lerobot.trainer import worker
+from accerl_lerobot.trainer.worker import WeightPublisher
+from accerl_lerobot.transport import (
     Address,
     Client,
     PendingRequest,
@@ -25,7 +26,6 @@ from accerl_lerobot.transport.connection import (
     Server,
     ServiceStoppedError,
 )
-from accerl_lerobot.transport.weights import Tensors, WeightPublisher
 from tests.replay.segments import make_segment
 from tests.transport.played import PlayedClient
 
@@ -299,7 +299,7 @@ class MortalService:
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "RETRY_S", 0.0)
+    monkeypatch.setattr(transport, "RETRY_S", 0.0)
 
 
 @pytest.mark.parametrize("lost", ["away", "dying"])
@@ -351,12 +351,12 @@ def test_a_replica_waits_for_newer_weights_but_not_for_ever(monkeypatch: pytest.
     publisher = WeightPublisher(["inference"], copied)
     threading.Timer(0.05, publisher.publish, (3, {})).start()
     assert publisher.newer_than("inference", -1) == (3, [{}])
-    monkeypatch.setattr(weights, "ASK_S", 0.01)
+    monkeypatch.setattr(worker, "ASK_S", 0.01)
     assert publisher.newer_than("inference", 3) == (3, [])
 
 
 def test_flush_waits_until_each_replica_has_applied_the_newest(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(weights, "ASK_S", 0.0)
+    monkeypatch.setattr(worker, "ASK_S", 0.0)
     publisher = WeightPublisher(["inference 0", "inference 1"], copied)
     publisher.flush(30)
     publisher.publish(1, {})

@@ -19,8 +19,7 @@ from accerl_lerobot.experience import IMAGINED, TASK, Decision, Segment
 from accerl_lerobot.rollout.runner import ActiveEpisode, EpisodePlan
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import OnlineLearnConfig, PixelModelConfig
-from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec
-from accerl_lerobot.world_model.data import Episode, model_arrays
+from accerl_lerobot.world_model.contract import Episode, Prediction, WorldModelSpec, model_arrays
 from accerl_lerobot.world_model.imagined import ImaginedEnvironment, World
 from accerl_lerobot.world_model.online import OnlineLearner, episode_from_segments
 from accerl_lerobot.world_model.pixels import PixelWorldModel

@@ -10,8 +10,7 @@ from accerl_lerobot.experience import Observations, task_codes
 from accerl_lerobot.world_model import latent
 from accerl_lerobot.world_model.config import LatentConfig
 from accerl_lerobot.world_model.latent import LatentModel, shifted
-from accerl_lerobot.world_model.state_learner import StateLearner
-from accerl_lerobot.world_model.states import StateSpec, Transitions
+from accerl_lerobot.world_model.states import StateLearner, StateSpec, Transitions
 
 FRONT, WRIST, ROBOT = "observation.images.front", "observation.images.wrist", "observation.state"
 SPEC = StateSpec(cameras={FRONT: 3}, state=3, environment_state=0, chunk=(2, 2))

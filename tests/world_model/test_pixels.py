@@ -17,13 +17,15 @@ from accerl_lerobot.world_model import pixels, pretrain
 from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import (
     Context,
+    Episode,
     LearnableWorldModel,
     Prediction,
     State,
     Windows,
+    WindowStart,
     WorldModelSpec,
+    cut_windows,
 )
-from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
 from accerl_lerobot.world_model.imagined import World
 from accerl_lerobot.world_model.pixels import FrameNetwork, PixelWorldModel
 from accerl_lerobot.world_model.pretrain import auroc, check, choose_threshold, donors, skill_and_sensitivity

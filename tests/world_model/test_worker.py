@@ -22,8 +22,7 @@ from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.world_model import worker as module
 from accerl_lerobot.world_model.config import LatentConfig, StateModelConfig
 from accerl_lerobot.world_model.latent import LatentModel
-from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
-from accerl_lerobot.world_model.states import Transitions
+from accerl_lerobot.world_model.states import BATCH, StateLearner, Transitions
 from accerl_lerobot.world_model.worker import RemoteStateLearner, WorldModelWorker
 from tests.runs import off_policy_run, polls
 from tests.world_model.test_latent import NUMBERS, model, transitions

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights that a study holds back."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.engines import Progress
+from accerl_lerobot.engines.config import LaunchConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation import EvaluationConfig
+from benchmarks import study
+from benchmarks.study import BenchStudyConfig, HeldBackEngine, bench_study
+from tests.runs import drive, tiny_run, until
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("--trainer.hold_back=50 --replay.max_lag=50", "replay.max_lag=50: use more than trainer.hold_back"),
+        ("--trainer.hold_back=-1", "trainer.hold_back='-1': use a number of updates"),
+    ],
+)
+def test_weights_to_hold_back_are_checked(setting: str, message: str, tmp_path: Path):
+    config = BenchStudyConfig(recipe="recipes/gipo.yaml", settings=(setting,), output_dir=str(tmp_path))
+    with pytest.raises(InputError, match=message):
+        bench_study(config)
+
+
+def test_weights_held_back_act_so_many_updates_late_and_a_run_resumes(tiny_checkpoint: Path, tmp_path: Path):
+    fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
+    config = tiny_run(
+        tiny_checkpoint, trainer=TrainerConfig(**fields, probe_every=4), launch=LaunchConfig(engine="local")
+    )
+
+    def begin(hold_back: int, state: Path | None = None) -> HeldBackEngine:
+        engine = HeldBackEngine(hold_back, config, ("match",), state=state)
+        engine.train()
+        return engine
+
+    def updates(history: list[Progress]) -> list[dict[str, float]]:
+        return [update for progress in history for update in progress.updates]
+
+    late = drive(begin(4))
+    lags = [update["lag_mean"] for update in updates(late)]
+    assert lags[0] == 0 and all(lag >= 4 for lag in lags[5:])
+    assert max(update.get("logprob/mismatch_max", 0.0) for update in updates(late)) < 1e-4
+    assert late[-1].inference["version"] == late[-1].version, "the last weights act at once"
+    left = begin(4)
+    before = until(left, 6)
+    left.save(tmp_path)
+    after = drive(begin(4, tmp_path / TRAINING_STATE))
+    assert updates(before + after) == updates(late)
+
+
+def test_a_cell_holds_weights_back(tiny_checkpoint: Path, tmp_path: Path):
+    folder = tmp_path / "cell"
+    run = tiny_run(
+        tiny_checkpoint,
+        output_dir=str(folder),
+        launch=LaunchConfig(engine="local"),
+        trainer=TrainerConfig(updates=14, batch_decisions=16),
+        evaluation=EvaluationConfig(before=False, episodes=1, videos=0),
+    )
+    study.train(folder, run, 4)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["updates"] == 14 and summary["lag_mean"] > 9 * 4 / 14
