@@ -58,7 +58,6 @@ from accerl_lerobot.run import resuming
 from accerl_lerobot.run.adapter import demonstrations_of, make_adapter
 from accerl_lerobot.run.loop import Loop, Recorder, Times, run_plans
 from accerl_lerobot.run.preflight import check_device, check_environment, check_policy, check_start
-from accerl_lerobot.run.sizes import check_memory
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
 from accerl_lerobot.world_model.config import ImaginationConfig
@@ -110,7 +109,6 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
 
     with ray_session.opened(config.launch):
         check_device(config)
-        check_memory(config)
         spec = check_environment(config.env, config.rollout.reward_model)
         config = replace(config, policy=pinned(config.policy))
         history = check_policy(config, spec)
@@ -290,7 +288,7 @@ class Run:
         config = self.config
         if self.load is None:
             checked = replace(config, output_dir=None)  # the folder is there by now
-            self.spec, _ = check_start(checked, self.console.say)
+            self.spec = check_start(checked, self.console.say)
         else:
             self.spec = check_environment(config.env)
         check_placement(config)
