@@ -91,19 +91,6 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
         raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
 
 
-@contextmanager
-def reading(field: str, value: str, files: str) -> Iterator[None]:
-    """Turns errors of reading a run's files into an `InputError`: the files are damaged or changed."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        logger.debug("reading %s of %s failed", files, value, exc_info=error)
-        why = f"{files} is not as a run writes it ({in_one_line(error)[:LONGEST]}); restore it, or begin anew"
-        raise InputError(field, value, why) from error
-
-
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
     known: list[BaseException] = []

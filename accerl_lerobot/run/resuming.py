@@ -19,7 +19,7 @@ from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
 from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, decode, encode
-from accerl_lerobot.errors import InputError, make_folder, reading
+from accerl_lerobot.errors import InputError, make_folder
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.replay.journal import EPISODES
 
@@ -39,9 +39,8 @@ def warm_started(directory: Path) -> Path | None:
     note = directory / WARM_START
     if not note.is_file():
         return None
-    with reading("config_path", str(directory), WARM_START):
-        content = json.loads(note.read_text())
-        return directory / str(content["policy"])
+    content = json.loads(note.read_text())
+    return directory / str(content["policy"])
 
 
 def resume_command(directory: Path, config: RunConfig) -> str:
