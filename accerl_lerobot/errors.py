@@ -123,15 +123,6 @@ def expanded(path: str, field: str) -> Path:
     return found
 
 
-def make_folder(path: Path, field: str, *, again: bool = False) -> None:
-    """Creates a folder and those above it; it may be there if `again`."""
-    try:
-        path.mkdir(parents=True, exist_ok=again)
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error
-
-
 @functools.cache
 def warn_once(text: str, name: str = __name__) -> None:
     """Warns by the logger of this name, unless this process has warned so before."""

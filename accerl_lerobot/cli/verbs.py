@@ -40,7 +40,7 @@ from accerl_lerobot.cli.export import ExportConfig, export_config, export_episod
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.console import Console, count, duration, number, rate
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.config import Load
@@ -187,7 +187,7 @@ def evaluate(arguments: list[str]) -> int:
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))
     if out is not None:
-        make_folder(out, "output_dir")
+        out.mkdir(parents=True)
         write_json(out / "evaluation.json", summary)
         for result in results:
             if not result.frames:

@@ -37,7 +37,7 @@ from huggingface_hub.utils import filter_repo_objects
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import FileSource, matching_files, unsafe_name
-from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder
+from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.hub.card import (
     CARD,
     CONFIG,
@@ -257,7 +257,7 @@ def pull(config: PullConfig) -> dict[str, Any]:
                 raise source.refuse(name, f"not safe to write: {why}")
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        make_folder(temporary, "output_dir", again=True)
+        temporary.mkdir(parents=True, exist_ok=True)
         snapshot_download(
             repo_id, repo_type=repo_type, revision=commit, local_dir=temporary, ignore_patterns=IGNORED
         )

@@ -40,15 +40,7 @@ from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.contract import Engine
 from accerl_lerobot.engines.placement import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
-from accerl_lerobot.errors import (
-    InputError,
-    check_absent,
-    expanded,
-    is_full,
-    kept_traceback,
-    make_folder,
-    printable,
-)
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, printable
 from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
@@ -79,7 +71,7 @@ def make_output_dir(config: Any) -> Path:
         path = expanded(config.output_dir, "output_dir")
     check_absent(path)
     check_disk(config.output_dir)
-    make_folder(path, "output_dir")
+    path.mkdir(parents=True)
     return path
 
 
