@@ -29,7 +29,6 @@ OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISK_GIB = 2.0  # space that demonstrations, checkpoints and videos of a run may need
 ADAMW_COPIES = 3  # of the trained weights: the gradient and the two moments
 RENDER_TIMEOUT_S = 120
-SETUP = "run make setup"
 DRAW = """
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 mujoco = import_mujoco()
@@ -79,7 +78,6 @@ def main(arguments: list[str]) -> int:
 def machine(*, joins: bool = False) -> Iterator[Check]:
     """Checks that any run needs; `joins` is True for a run on a Ray cluster."""
     yield Check("python", OK, f"{platform.python_version()} in {sys.prefix}")
-    yield packages()
     yield from libraries(joins)
     yield Check("cpu", OK, f"{len(os.sched_getaffinity(0))} cores")
     yield Check("memory", OK, f"{memory_gib('MemAvailable'):.1f} GiB free")
@@ -87,34 +85,12 @@ def machine(*, joins: bool = False) -> Iterator[Check]:
     yield compared("disk", f"{disk:.0f} GiB free here", disk >= DISK_GIB, f"a run may need {DISK_GIB:.0f}")
 
 
-def packages() -> Check:
-    """Installed versions against the ranges of this package's requirements."""
-    from packaging.requirements import Requirement
-
-    wrong = []
-    status = WARN
-    for requirement in map(Requirement, importlib.metadata.requires("accerl-lerobot") or ()):
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
-            continue
-        try:
-            version = importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
-            wrong.append(f"{requirement.name} is missing")
-            status = FAIL
-            continue
-        if not requirement.specifier.contains(version, prereleases=True):
-            wrong.append(f"{requirement.name} {version}, not {requirement.specifier}")
-    if wrong:
-        return Check("packages", status, f"{'; '.join(wrong)}: {SETUP}")
-    lerobot = importlib.metadata.version("lerobot")
-    return Check("packages", OK, f"all within their ranges, lerobot {lerobot} among them")
-
-
 def libraries(joins: bool) -> Iterator[Check]:
-    """Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
+    """LeRobot, Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
     from accerl_lerobot.engines import ray_session
 
     try:
+        yield Check("lerobot", OK, importlib.metadata.version("lerobot"))
         ray_session.prepare(joins)
         import ray
 
@@ -123,7 +99,7 @@ def libraries(joins: bool) -> Iterator[Check]:
 
         yield Check("torch", OK, str(torch.__version__))
     except Exception as error:
-        yield Check("ray", FAIL, f"Ray or torch cannot be imported ({in_one_line(error)}); {SETUP}")
+        yield Check("libraries", FAIL, f"one cannot be imported ({in_one_line(error)}); run make setup")
         return
     text = "none"
     if torch.cuda.is_available():
