@@ -349,7 +349,7 @@ def _count(counters: ReplayCounters, name: str, amount: int) -> None:
 
 
 def is_finite(segment: Segment) -> bool:
-    """True if no floating-point number of the segment is a NaN or an infinity."""
-    arrays = [segment.log_prob, segment.reward, *segment.latent.values(), *segment.observations.values()]
+    """True if log-probs and latents have no NaN or infinity; the runner checks the environment's numbers."""
+    arrays = [segment.log_prob, *segment.latent.values()]
     floating = [array for array in arrays if np.issubdtype(array.dtype, np.inexact)]
     return all(np.isfinite(array).all() for array in floating)
