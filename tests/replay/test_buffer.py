@@ -33,7 +33,7 @@ def test_the_oldest_leave_first_and_by_decisions() -> None:
     replay = make_replay(capacity=10, max_unlearned_decisions=10)
     for i, n in enumerate([4, 4, 3]):
         assert replay.insert(make_segment(f"k{i}", n))
-    assert replay.stored_decisions == 7 and replay.counters.evicted_decisions == 4
+    assert replay.stored_decisions == 7 and replay.counters.removed_decisions == 4
     assert sorted(keys(replay.sample(7, 0, np.random.default_rng(0)))) == ["k1", "k2"]
     assert replay.counters.evicted_unused == 1
     assert_books_balance(replay)
@@ -92,9 +92,9 @@ def test_nothing_older_than_max_lag_is_drawn() -> None:
     replay.insert(make_segment("edge", version=5))
     rng = np.random.default_rng(0)
     assert keys(replay.sample(4, 10, rng)) == ["edge"]  # lag 5 is allowed, one decision with lag 6 is not
-    assert replay.counters.retired_segments == 1 and replay.counters.retired_unused == 1
+    assert replay.counters.removed_segments == 1 and replay.counters.retired_unused == 1
     assert replay.sample(4, 11, rng) == []
-    assert replay.counters.retired_segments == 2 and replay.counters.retired_unused == 1
+    assert replay.counters.removed_segments == 2 and replay.counters.retired_unused == 1
     assert_books_balance(replay)
 
 
