@@ -115,19 +115,6 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
         raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
 
 
-@contextmanager
-def reading(field: str, value: str, files: str) -> Iterator[None]:
-    """Turns errors of reading a run's files into an `InputError`: the files are damaged or changed."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        logger.debug("reading %s of %s failed", files, value, exc_info=error)
-        why = f"{files} is not as a run writes it ({in_one_line(error)[:LONGEST]}); restore it, or begin anew"
-        raise InputError(field, value, why) from error
-
-
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
     known: list[BaseException] = []
@@ -158,15 +145,6 @@ def expanded(path: str, field: str) -> Path:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(field, path, f"cannot be a path: {why}") from error
     return found
-
-
-def make_folder(path: Path, field: str, *, again: bool = False) -> None:
-    """Creates a folder and those above it; it may be there if `again`."""
-    try:
-        path.mkdir(parents=True, exist_ok=again)
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error
 
 
 @functools.cache

@@ -16,9 +16,9 @@ DEMO_SEEDS = range(0, 1_000_000_000)
 TRAIN_SEEDS = range(1_000_000_000, 2_000_000_000)
 EVAL_SEEDS = range(2_000_000_000, 3_000_000_000)
 
-_WORKERS_PER_RUN = 1_000
+_WORKERS_PER_RUN = 1_000  # the limit of `rollout.workers`
 _PRIME = 999_999_937  # the largest below 10**9, the size of a range
-_EVALUATIONS_PER_RUN = 10_000
+_EVALUATIONS_PER_RUN = 10_000  # the limit of `evaluation.episodes`
 _DECISIONS_PER_EPISODE = 1_000_003
 
 
@@ -29,8 +29,6 @@ def demo_seed(run_seed: int, index: int) -> int:
 
 def train_seed(run_seed: int, worker: int, episode: int) -> int:
     """Seed of a training episode; no two of a run are equal before a worker's 999,999th."""
-    if not 0 <= worker < _WORKERS_PER_RUN:
-        raise ValueError(f"worker {worker}: a run has at most {_WORKERS_PER_RUN}")
     return _permuted(TRAIN_SEEDS, run_seed, episode * _WORKERS_PER_RUN + worker)
 
 
@@ -65,8 +63,6 @@ def eval_seed(run_seed: int, index: int) -> int:
     Runs of the same seed are evaluated on the same episodes and can be compared by pairs. Runs of different
     seeds below 100,000 are evaluated on different ones, so that results over seeds do not share their luck.
     """
-    if not 0 <= index < _EVALUATIONS_PER_RUN:
-        raise ValueError(f"evaluation episode {index}: use 0 to {_EVALUATIONS_PER_RUN - 1}")
     place = run_seed * _EVALUATIONS_PER_RUN + index
     return EVAL_SEEDS.start + place % len(EVAL_SEEDS)
 

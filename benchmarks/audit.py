@@ -2,7 +2,7 @@
 """Audit of a run's own files: was anything that counted lost, or counted twice?
 
 updates      each is in ``metrics.jsonl`` once, and none is missing before the newest
-books        inserted = stored + evicted + retired, as replay counts its segments
+books        inserted = stored + removed, as replay counts its segments
 segments     those that the journal has up to the last checkpoint are those that replay had counted by
              then, each once; and all that the checkpoint stores are among them
 """
@@ -19,7 +19,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import ReplayCounters
 from accerl_lerobot.replay.journal import EPISODES, read_journal
 
-STORED = ("stored", "evicted", "retired")
+STORED = ("stored", "removed")
 
 
 def audit_updates(records: list[dict[str, Any]]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMM
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.errors import InputError, check_absent, make_folder
+from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.evaluation import Rate
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
@@ -109,7 +109,7 @@ def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
     root, console = Path(config.output_dir).expanduser().resolve(), Console()
     recipe = recipe_of(config)
     check_absent(root)
-    make_folder(root, "output_dir")
+    root.mkdir(parents=True)
     start = Start(config.recipe, recipe, config.stall_s, root, console)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "hits": [], "runs": []}
     for target in config.targets:

@@ -17,18 +17,32 @@ from typing import Annotated, Any, ClassVar, Literal
 from rich.table import Table
 
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
-from accerl_lerobot.demos.backbone import Sizes, write_backbone
+from accerl_lerobot.demos.backbone import write_backbone
 from accerl_lerobot.policies.config import TuningConfig
 from benchmarks.tables import as_table, host, ranged, spread
 
 STATE = "observation.state"
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""
-SMOLVLM2_500M = Sizes(
-    hidden=960, layers=32, heads=15, kv_heads=5, intermediate=2560, embeddings=49280,
-    vision_hidden=768, vision_layers=12, vision_heads=12, vision_intermediate=3072,
-    patch=16, image=512, shuffle=4,
-)  # fmt: skip
+SMOLVLM2_500M: dict[str, Any] = {
+    "text": {
+        "hidden_size": 960,
+        "intermediate_size": 2560,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 15,
+        "num_key_value_heads": 5,
+        "vocab_size": 49280,
+    },
+    "vision": {
+        "hidden_size": 768,
+        "intermediate_size": 3072,
+        "num_hidden_layers": 12,
+        "num_attention_heads": 12,
+        "image_size": 512,
+        "patch_size": 16,
+    },
+    "shuffle": 4,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,6 +240,6 @@ def lerobot_config(config: BenchPolicyConfig, directory: Path) -> Any:
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))}
     fields: dict[str, Any] = {"input_features": inputs, "output_features": outputs, "push_to_hub": False}
     if config.type == "smolvla":
-        backbone = write_backbone(directory / "backbone", [], SMOLVLM2_500M)
+        backbone = write_backbone(directory / "backbone", **SMOLVLM2_500M)
         fields |= {"vlm_model_name": str(backbone), "load_vlm_weights": False, "num_vlm_layers": 16}
     return make_policy_config(config.type, **fields, device="cpu")

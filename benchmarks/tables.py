@@ -17,7 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot import __version__
-from accerl_lerobot.errors import InputError, expanded, make_folder
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import Interval
 
 PACKAGES = ("lerobot", "torch", "ray", "numpy")
@@ -72,7 +72,7 @@ def named(config: Any, *names: str) -> None:
 def output_folder(path: str) -> Path:
     """The folder ``output_dir`` names, created if it is not there; results of before are kept in it."""
     folder = expanded(path, "output_dir")
-    make_folder(folder, "output_dir", again=True)
+    folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 

@@ -24,7 +24,7 @@ from rich.table import Table
 from accerl_lerobot.config.ranges import Pattern, Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines import ray_session
-from accerl_lerobot.errors import check_absent, make_folder
+from accerl_lerobot.errors import check_absent
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport import Client, Server
 from benchmarks.tables import as_markdown, as_table, host, named, ranged, spread, write
@@ -117,7 +117,7 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
     load = os.getloadavg()[0]
     result = {"config": asdict(config), "host": before, "load_after": load, "results": results}
     if folder is not None:
-        make_folder(folder, "output_dir")
+        folder.mkdir(parents=True)
         write(folder, "transport", result, as_markdown(_COLUMNS, _rows(result)))
         console.say(f"wrote transport.json and .md into {folder}")
     return result

@@ -18,7 +18,6 @@ from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig, decode, encode, parse
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.run import sizes
 from accerl_lerobot.run.preflight import check_sft_policy, check_start
 
 ROOT = Path(__file__).parents[1]
@@ -152,16 +151,6 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 def test_odd_text_stays_text() -> None:
     for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "*x"):
         assert parse(RunConfig, [f"--job_name={text}"]).job_name == text
-
-
-def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sizes, "memory_gib", lambda entry: 16.0)
-    sizes.check_memory(parse(RunConfig, ["--rollout.workers=8"]))
-    with pytest.raises(InputError, match=r"rollout\.environments=8: the run needs about .* GiB of memory"):
-        sizes.check_memory(parse(RunConfig, ["--rollout.workers=100"]))
-    with pytest.raises(InputError, match=r"replay\.capacity=50000000"):
-        sizes.check_memory(parse(RunConfig, ["--replay.capacity=50000000"]))
-    sizes.check_memory(parse(RunConfig, ["--rollout.workers=100", "--launch.address=auto"]))
 
 
 ARENA = f"them/arena@{'0123456789' * 4}"

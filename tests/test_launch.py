@@ -130,8 +130,7 @@ def test_samples_lag_behind_and_the_lag_is_bounded(story: Story):
 def test_the_books_of_replay_balance(story: Story):
     books = story.history[-1].replay
     for unit in ("segments", "decisions"):
-        gone = sum(books[f"{how}_{unit}"] for how in ("evicted", "retired"))
-        assert books[f"inserted_{unit}"] == books[f"stored_{unit}"] + gone
+        assert books[f"inserted_{unit}"] == books[f"stored_{unit}"] + books[f"removed_{unit}"]
     assert books["dropped_nonfinite"] == 0
     # What the trainer learned from is what replay handed out: no batch was drawn and then forgotten.
     assert books["trained_decisions"] == sum(u["decisions"] for u in story.updates)

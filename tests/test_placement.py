@@ -102,8 +102,6 @@ def test_cuda_is_not_looked_for_on_nodes_without():
 @pytest.mark.parametrize(
     ("fields", "match"),
     [
-        ({"address": "here"}, r"launch\.address='here': use HOST:PORT"),
-        ({"address": "here:0"}, r"launch\.address='here:0': use HOST:PORT"),
         (
             {"address": "auto", "engine": "local"},
             r"launch\.address='auto': launch\.engine=local is one process",

@@ -21,15 +21,14 @@ from typing import TYPE_CHECKING, NamedTuple
 from accerl_lerobot.config.machine import GIB, memory_gib
 from accerl_lerobot.engines.config import lag_limits
 from accerl_lerobot.errors import InputError, in_one_line
-from accerl_lerobot.run import sizes
 
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import RunConfig
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISK_GIB = 2.0  # space that demonstrations, checkpoints and videos of a run may need
+ADAMW_COPIES = 3  # of the trained weights: the gradient and the two moments
 RENDER_TIMEOUT_S = 120
-SETUP = "run make setup"
 DRAW = """
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 mujoco = import_mujoco()
@@ -79,7 +78,6 @@ def main(arguments: list[str]) -> int:
 def machine(*, joins: bool = False) -> Iterator[Check]:
     """Checks that any run needs; `joins` is True for a run on a Ray cluster."""
     yield Check("python", OK, f"{platform.python_version()} in {sys.prefix}")
-    yield packages()
     yield from libraries(joins)
     yield Check("cpu", OK, f"{len(os.sched_getaffinity(0))} cores")
     yield Check("memory", OK, f"{memory_gib('MemAvailable'):.1f} GiB free")
@@ -87,34 +85,12 @@ def machine(*, joins: bool = False) -> Iterator[Check]:
     yield compared("disk", f"{disk:.0f} GiB free here", disk >= DISK_GIB, f"a run may need {DISK_GIB:.0f}")
 
 
-def packages() -> Check:
-    """Installed versions against the ranges of this package's requirements."""
-    from packaging.requirements import Requirement
-
-    wrong = []
-    status = WARN
-    for requirement in map(Requirement, importlib.metadata.requires("accerl-lerobot") or ()):
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
-            continue
-        try:
-            version = importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
-            wrong.append(f"{requirement.name} is missing")
-            status = FAIL
-            continue
-        if not requirement.specifier.contains(version, prereleases=True):
-            wrong.append(f"{requirement.name} {version}, not {requirement.specifier}")
-    if wrong:
-        return Check("packages", status, f"{'; '.join(wrong)}: {SETUP}")
-    lerobot = importlib.metadata.version("lerobot")
-    return Check("packages", OK, f"all within their ranges, lerobot {lerobot} among them")
-
-
 def libraries(joins: bool) -> Iterator[Check]:
-    """Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
+    """LeRobot, Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
     from accerl_lerobot.engines import ray_session
 
     try:
+        yield Check("lerobot", OK, importlib.metadata.version("lerobot"))
         ray_session.prepare(joins)
         import ray
 
@@ -123,7 +99,7 @@ def libraries(joins: bool) -> Iterator[Check]:
 
         yield Check("torch", OK, str(torch.__version__))
     except Exception as error:
-        yield Check("ray", FAIL, f"Ray or torch cannot be imported ({in_one_line(error)}); {SETUP}")
+        yield Check("libraries", FAIL, f"one cannot be imported ({in_one_line(error)}); run make setup")
         return
     text = "none"
     if torch.cuda.is_available():
@@ -163,10 +139,11 @@ def recipe(arguments: list[str]) -> Iterator[Check]:
     from accerl_lerobot.run.preflight import check_start
     from accerl_lerobot.world_model.imagined import check_imagination
 
-    _, history = check_start(config)
+    check_start(config)
     yield Check("recipe", OK, "resolves")
     yield rendering(needed=config.env.type in ("metaworld", "libero"))
-    yield from resources(config, history)
+    yield resources(config)
+    yield from gpu_memory(config)
     yield from pace(config)
     count = config.imagination.environments
     if count:
@@ -176,20 +153,15 @@ def recipe(arguments: list[str]) -> Iterator[Check]:
         yield Check("placement", OK, row)
 
 
-def resources(config: RunConfig, history: int = 1) -> Iterator[Check]:
-    """Cores and memory against what the recipe will take; `history` is the policy's ``n_obs_steps``."""
+def resources(config: RunConfig) -> Check:
+    """Cores of this machine against the processes and threads of the recipe."""
     cores = len(os.sched_getaffinity(0))
     workers = config.rollout.workers
     threads = max(config.trainer.num_threads, config.inference.num_threads)
     networks = f"{config.inference.workers} inference, {config.trainer.ranks} trainer"
     text = f"{cores} for {workers} rollout workers, {networks}"
     hint = "lower rollout.workers, trainer.num_threads or inference.num_threads"
-    yield compared("cores", text, max(workers, threads) <= cores, hint)
-    need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
-    text = f"about {need:.1f} GiB of memory needed"
-    hint = "lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
-    yield compared("needs", text, need <= memory_gib("MemAvailable"), hint)
-    yield from gpu_memory(config)
+    return compared("cores", text, max(workers, threads) <= cores, hint)
 
 
 def gpu_memory(config: RunConfig) -> Iterator[Check]:
@@ -201,7 +173,10 @@ def gpu_memory(config: RunConfig) -> Iterator[Check]:
     if config.policy.path is None or resolve_device(config.policy.device).type == "cpu":
         return
     policy = policy_sizes(config.policy)
-    need = 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / GIB
+    copies = ADAMW_COPIES
+    if config.trainer.probe_every:
+        copies += 1  # the weights of the probe
+    need = 4 * (policy.policy + policy.trained * copies) / GIB
     memory = torch.cuda.get_device_properties(0).total_memory / GIB
     text = f"weights, gradients and AdamW take {need:.1f} GiB of GPU memory"
     hint = "use policy.tuning.mode=lora, or several GPUs and trainer.sharding=zero3"

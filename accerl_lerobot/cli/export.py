@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.layout import CONFIG, write_json
+from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
 from accerl_lerobot.config.parsing import parse, read_arguments, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
@@ -30,8 +30,6 @@ from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.replay.journal import EPISODES, JournalEntry, read_journal, whole_episodes
 from accerl_lerobot.rollout.runner import RolloutConfig
 
-SIDECAR = Path("meta") / "accerl_rollouts.json"
-"""File of the dataset: its origin, and how many episodes it has."""
 VERSION = "policy_version"  # feature: updates behind the weights that chose the action
 TOLERANCE = 1e-4  # by how much rewards of a decision may differ, as they are summed in another order
 
@@ -108,8 +106,6 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         if not tally["episodes"]:
             hint = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), hint)
-        origin = {"path": run.name, "pick": config.pick}
-        write_json(folder / SIDECAR, {"export": origin, **tally})
     left_out = tally["left_out"]
     if left_out:
         console.say(f"{left_out} of {len(episodes)} episodes differed from the run and are left out")

@@ -40,7 +40,7 @@ from accerl_lerobot.cli.export import ExportConfig, export_config, export_episod
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.console import Console, count, duration, number, rate
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.config import Load
@@ -102,7 +102,6 @@ def sft(arguments: list[str]) -> int:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
-    from accerl_lerobot.config.machine import check_disk
     from accerl_lerobot.policies.loading import resolve_device
     from accerl_lerobot.run.preflight import check_environment, check_training_data, sft_policy
     from accerl_lerobot.run.train import fine_tune, make_output_dir
@@ -111,7 +110,6 @@ def sft(arguments: list[str]) -> int:
     policy = sft_policy(config.sft)
     spec = None if config.env is None else check_environment(config.env)
     check_training_data(config.sft, config.dataset, policy, spec, {})
-    check_disk(config.output_dir)
     directory = make_output_dir(config)
     with redirect_stdout(sys.stderr), kept_traceback(directory):
         path = fine_tune(config.sft, config.dataset, directory, config.seed, device, Console())
@@ -187,7 +185,7 @@ def evaluate(arguments: list[str]) -> int:
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))
     if out is not None:
-        make_folder(out, "output_dir")
+        out.mkdir(parents=True)
         write_json(out / "evaluation.json", summary)
         for result in results:
             if not result.frames:

@@ -7,9 +7,7 @@ dataset, so the content does not depend on how many processes worked on it.
 
 from __future__ import annotations
 
-import importlib.metadata
 import itertools
-import json
 import math
 import multiprocessing
 import os
@@ -19,13 +17,12 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import draccus
 import numpy as np
 
 from accerl_lerobot import guardian
@@ -50,13 +47,10 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observ
 from accerl_lerobot.seeds import demo_seed
 
 REPO_ID = "accerl/demos"  # name of a recorded dataset, which is where its folder is
-SIDECAR = Path("meta") / "accerl_demos.json"
-"""Inside the dataset: the two configs, what came of them, and the versions that decide on the physics."""
 
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
 MOST_PROCESSES = 8  # a container may see more cores than it has
-_DISTRIBUTIONS = ("lerobot", "metaworld", "hf-libero", "robosuite", "mujoco", "numpy")
 
 Expert = Callable[[], np.ndarray]  # gives the next action for the state its environment is in
 
@@ -333,29 +327,17 @@ def record_demos(
     for task in spec.tasks:
         make_expert(env_config, environment, task)  # refuses a task without an expert before any work
     environment.close()
-    tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
+    tally = {"episodes": 0, "frames": 0, "successes": 0}
     record = partial(record_one, env_config, config, seed)
     with (
         appearing(folder) as unfinished,
         simulated(env_config, record, range(config.episodes)) as episodes,
         console.stage("demonstrations", total=config.episodes) as stage,
+        new_dataset(unfinished, REPO_ID, spec, env_config) as dataset,
     ):
-        with new_dataset(unfinished, REPO_ID, spec, env_config) as dataset:
-            for episode, discarded in episodes:
-                save_episode(dataset, episode, tally)
-                tally["discarded"] += discarded
-                stage.update(tally["episodes"])
-        versions = {}
-        for name in _DISTRIBUTIONS:
-            with suppress(importlib.metadata.PackageNotFoundError):
-                versions[name] = importlib.metadata.version(name)
-        sidecar = {
-            "env": draccus.encode(env_config, EnvConfig),
-            "demos": asdict(config) | {"seed": seed},
-            **tally,
-            "versions": versions,
-        }
-        (unfinished / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
+        for episode in episodes:
+            save_episode(dataset, episode, tally)
+            stage.update(tally["episodes"])
     console.say("{episodes} episodes, {frames} frames, {successes} successes".format(**tally))
     return folder
 
@@ -397,8 +379,8 @@ def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[st
     return table
 
 
-def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> tuple[Episode, int]:
-    """The episode at place `slot` of the dataset, and how many tries were thrown away for it."""
+def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> Episode:
+    """The episode at place `slot` of the dataset."""
     environment = this_environment()
     tasks = environment.spec.tasks
     share = config.failure_share
@@ -413,7 +395,7 @@ def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int)
         )
         episode = played(environment, task, own_seed, actions)
         if episode.success != fail or (config.push and not fail):
-            return episode, attempt
+            return episode
     outcome = "fail" if fail else "succeed"
     hint = f"{_MAX_TRIES} tries of {task} in a row did not {outcome}; lower it"
     hint += ", or allow more env steps (env.max_steps)"

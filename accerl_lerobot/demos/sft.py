@@ -26,7 +26,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, disp
 from accerl_lerobot.checkpoint.safety import FileSource, read_json
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
-from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
+from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent, expanded, last_exception
 from accerl_lerobot.experience import REWARD, SUCCESS
 from accerl_lerobot.policies.config import check_registered, discovery, register_policies
@@ -166,7 +166,7 @@ def run_sft(
     if config.init_path is not None:
         config = replace(config, init_path=str(_start(config.init_path, output_dir.parent / "init")))
     elif config.backbone is not None:
-        write_backbone(output_dir.parent / "backbone", texts, Sizes(**vars(config.backbone)))
+        write_backbone(output_dir.parent / "backbone", texts, config.backbone)
     command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))
     # With Ray's token a process can run code in Ray's workers; a trainer has no business there.

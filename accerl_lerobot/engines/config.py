@@ -78,11 +78,6 @@ class LaunchConfig(Section, section="launch"):
             if role not in ROLES or not nodes.strip():
                 hint = f"use one of {', '.join(ROLES)}, and a resource of nodes, or all"
                 raise InputError(f"launch.placement.{role}", nodes, hint)
-        if self.address is not None and self.address != "auto":
-            host, _, port = self.address.rpartition(":")
-            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-                hint = "use HOST:PORT as ray start --head prints it, or auto"
-                raise InputError("launch.address", self.address, hint)
         if self.address is None and self.placement:
             hint = "a private Ray has one node; add --launch.address=auto, or leave the field out"
             raise InputError("launch.placement", self.placement, hint)

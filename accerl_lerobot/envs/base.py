@@ -147,8 +147,6 @@ class EpisodeEnvironment(Environment):
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
             raise InputError("task", task, f"this environment has: {', '.join(self.spec.tasks)}")
-        if not 0 <= seed < 2**32:
-            raise InputError("seed", seed, "use 0 to 2**32 - 1")
         self._done = True  # an error below leaves an environment that must be reset
         self._begin(seed, task)
         self._task = task

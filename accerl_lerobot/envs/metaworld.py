@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import json
-from collections import deque
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.config.ranges import Positive, Range, Section
+from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import Renderers, diverged, draw_fast, import_mujoco
 
@@ -62,32 +61,11 @@ class ShiftConfig(Section, section="env.shift"):
 
     camera: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """Metres added to the position of every camera, along its body's x, y and z."""
-    light: Positive = 1.0
-    """Factor on the intensity of all lights."""
-    friction: Positive = 1.0
-    """Factor on the sliding friction of all surfaces."""
-    action_delay: Annotated[int, Range("[0, 100]")] = 0
-    """Env steps between an action and its execution; zero actions fill the gap at the start of an episode."""
-    start_range: Positive = 1.0
-    """Factor on the ranges that start and goal positions are drawn from, about their centres. Far above 1,
-    some starts are out of reach."""
 
     def apply(self, simulator: Any, cameras: Sequence[str]) -> None:
         """Changes a MetaWorld simulator that has just been built, and moves these cameras of it."""
-        from gymnasium.spaces import Box
-
-        model = simulator.model
         for name in cameras:
-            model.cam(name).pos[:] += self.camera
-        for kind in ("ambient", "diffuse", "specular"):
-            getattr(model, f"light_{kind}")[:] *= self.light
-            getattr(model.vis.headlight, kind)[:] *= self.light
-        model.geom_friction[:, 0] *= self.friction
-        if self.start_range != 1:
-            space = simulator._random_reset_space
-            centre = (space.high + space.low) / 2
-            half = self.start_range * ((space.high - space.low) / 2)
-            simulator._random_reset_space = Box(centre - half, centre + half, dtype=space.dtype)
+            simulator.model.cam(name).pos[:] += self.camera
 
 
 STATE_DIM = 4
@@ -166,7 +144,6 @@ class Simulator:
             draw_fast(env.model)
         config.shift.apply(env, config.cameras)
         env.touching_object = functools.partial(touching_object, env)
-        self._delay = config.shift.action_delay
         self._renderers = Renderers(env.model)
 
     def reset(self, seed: int) -> None:
@@ -176,12 +153,10 @@ class Simulator:
         # MetaWorld moves the goal marker after its last forward pass, so that the first frame would show an
         # older goal. This places the markers and leaves the physics as it is.
         import_mujoco().mj_kinematics(self.env.model, self.env.data)
-        self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self._delay)
 
     def step(self, action: np.ndarray) -> tuple[bool, bool]:
         """One env step; True if it succeeded, and True if the simulator has not diverged."""
-        self._delayed.append(action)
-        self._raw, _, _, _, info = self.env.step(self._delayed.popleft())
+        self._raw, _, _, _, info = self.env.step(action)
         return bool(info["success"]), not diverged(self.env.data)
 
     def state(self) -> np.ndarray:

@@ -206,24 +206,19 @@ def success_curve(
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
     """Writes rows of clips, of equal width, as MP4; a clip that ends early holds its last frame.
 
-    Frames are uint8 (H, W, 3), all of one height in a row.
+    Frames are uint8 (H, W, 3), all of one height in a row. LeRobot leaves an odd last row or column out.
     """
-    import imageio.v2 as imageio
+    from lerobot.utils import io_utils
 
     length = max(max(map(len, row)) for row in rows)
-    # The pixel format every player knows, at the price of even sides: an odd last row or column is left out.
-    writer: Any = imageio.get_writer(
-        path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv420p"
-    )
-    with writer:
-        for i in range(length + fps):
-            lines = []
-            for row in rows:
-                pictures = [clip[min(i, len(clip) - 1)] for clip in row]
-                lines.append(_joined(pictures, axis=1))
-            picture = _joined(lines, axis=0)
-            height, width = picture.shape[:2]
-            writer.append_data(picture[: height // 2 * 2, : width // 2 * 2])
+    frames = []
+    for i in range(length + fps):
+        lines = []
+        for row in rows:
+            pictures = [clip[min(i, len(clip) - 1)] for clip in row]
+            lines.append(_joined(pictures, axis=1))
+        frames.append(_joined(lines, axis=0))
+    io_utils.write_video(path, frames, fps)
 
 
 @for_viewing("film")

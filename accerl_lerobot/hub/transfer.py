@@ -37,7 +37,7 @@ from huggingface_hub.utils import filter_repo_objects
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import FileSource, matching_files, unsafe_name
-from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder, reading
+from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.hub.card import (
     CARD,
     CONFIG,
@@ -106,8 +106,7 @@ def push(config: PushConfig) -> dict[str, Any]:
     """
     folder = expanded(config.path, "path")
     artifact = recognise(folder)
-    with reading("path", config.path, "a file of it, or of its run,"):
-        files = stage(config, folder, artifact)
+    files = stage(config, folder, artifact)
     if get_token() is None:
         raise InputError("repo_id", config.repo_id, f"pushing needs a token; {LOGIN} that may write")
     with hub_errors(config.repo_id, BRANCH):
@@ -258,18 +257,17 @@ def pull(config: PullConfig) -> dict[str, Any]:
                 raise source.refuse(name, f"not safe to write: {why}")
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        make_folder(temporary, "output_dir", again=True)
+        temporary.mkdir(parents=True, exist_ok=True)
         snapshot_download(
             repo_id, repo_type=repo_type, revision=commit, local_dir=temporary, ignore_patterns=IGNORED
         )
     shutil.rmtree(temporary / ".cache", ignore_errors=True)
     try:
-        with reading("repo_id", repo_id, "one of its files"):
-            artifact = recognise(temporary, "repo_id")
-            layout.check_names(temporary, source)
-            if artifact == POLICY:
-                layout.relocate(temporary, home)
-    except InputError:
+        artifact = recognise(temporary, "repo_id")
+        layout.check_names(temporary, source)
+        if artifact == POLICY:
+            layout.relocate(temporary, home)
+    except Exception:
         shutil.rmtree(temporary)  # resuming would not make it better
         raise
     record = {

@@ -144,8 +144,6 @@ class PolicyConfig(Section, section="policy"):
     tuning: TuningConfig = field(default_factory=TuningConfig)
     rename_map: dict[str, str] = field(default_factory=dict)
     """Environment feature name → policy feature name, as in LeRobot's ``--rename_map``."""
-    temporal_ensemble_coeff: Literal["checkpoint"] | None = "checkpoint"
-    """null: ACT does not average over earlier chunks, whose actions depend on more than the observation."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None keeps the checkpoint's. Written into what is saved."""
     n_action_steps: Annotated[int, Range("[1, 100000]")] | None = None
@@ -306,8 +304,6 @@ def override(policy_config: Any, config: PolicyConfig, *, learns: bool = False) 
         "use_peft": False,  # an adapter is merged into the weights
         "compile_model": False,  # a compiled sampler rounds unlike the re-scoring pass
     }
-    if config.temporal_ensemble_coeff is None:
-        fixed["temporal_ensemble_coeff"] = None
     if learns or policy_config.type in POLICIES:
         fixed |= dict.fromkeys(DTYPES, "float32")
     for name, value in fixed.items():

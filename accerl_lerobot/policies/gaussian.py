@@ -113,7 +113,8 @@ class ACT(GaussianModel):
         super().__init__(policy)
         config = policy.config
         if config.temporal_ensemble_coeff is not None:
-            hint = "averaging over earlier chunks makes actions depend on more than the observation; use null"
+            hint = "averaging over earlier chunks makes actions depend on more than the observation; "
+            hint += "set it to null in config.json"
             raise NoDensityError("policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, hint)
         self.executed = config.n_action_steps
         self.action_dim = config.action_feature.shape[0]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bounded store of segments, and the pace at which it is filled and drawn from.
 
-    inserted = stored + evicted + retired        in segments and in decisions
+    inserted = stored + removed        in segments and in decisions
 
-*Evicted* segments made room for newer ones, *retired* ones were older than `max_lag` allows. A non-finite
-segment is counted and not inserted.
+Removed segments are *evicted* or *retired*: they made room for newer ones, or were older than `max_lag`
+allows. A non-finite segment is counted and not inserted.
 
 The pace is counted in decisions. On entering the store each segment gets a number of draws (`draws_for`). A
 segment with draws left is *available*. With batch ≤ max_unlearned_decisions, one of `may_sample` and
@@ -139,11 +139,9 @@ class ReplayCounters:
     inserted_segments: int = 0
     inserted_decisions: int = 0
     inserted_imagined: int = 0  # the imagined ones of these decisions
-    evicted_segments: int = 0
-    evicted_decisions: int = 0
+    removed_segments: int = 0
+    removed_decisions: int = 0
     evicted_unused: int = 0
-    retired_segments: int = 0
-    retired_decisions: int = 0
     retired_unused: int = 0
     dropped_nonfinite: int = 0  # segments refused because they hold a NaN or an infinity
     trained_decisions: int = 0  # drawn by the trainer, repetitions counted
@@ -292,7 +290,7 @@ class Replay:
             if times == entry.uses:
                 counters.unique_decisions -= entry.size
                 if entry.left:
-                    _count(counters, f"{entry.left}_unused", 1)
+                    _count_unused(counters, entry.left)
         entries: list[dict[str, Any]] = []
         for entry in self._entries:
             uses = entry.uses - unlearned[entry]
@@ -339,17 +337,22 @@ class Replay:
             self.available_decisions -= entry.size
         entry.segment = None
         entry.left = how
-        _count(self.counters, f"{how}_segments", 1)
-        _count(self.counters, f"{how}_decisions", entry.size)
-        _count(self.counters, f"{how}_unused", int(entry.uses == 0))
+        self.counters.removed_segments += 1
+        self.counters.removed_decisions += entry.size
+        if entry.uses == 0:
+            _count_unused(self.counters, how)
 
 
-def _count(counters: ReplayCounters, name: str, amount: int) -> None:
-    setattr(counters, name, getattr(counters, name) + amount)
+def _count_unused(counters: ReplayCounters, how: str) -> None:
+    """Counts a segment that has left without being trained on."""
+    if how == "evicted":
+        counters.evicted_unused += 1
+    else:
+        counters.retired_unused += 1
 
 
 def is_finite(segment: Segment) -> bool:
-    """True if no floating-point number of the segment is a NaN or an infinity."""
-    arrays = [segment.log_prob, segment.reward, *segment.latent.values(), *segment.observations.values()]
+    """True if log-probs and latents have no NaN or infinity; the runner checks the environment's numbers."""
+    arrays = [segment.log_prob, *segment.latent.values()]
     floating = [array for array in arrays if np.issubdtype(array.dtype, np.inexact)]
     return all(np.isfinite(array).all() for array in floating)

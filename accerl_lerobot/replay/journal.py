@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.errors import InputError, reading
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment, SegmentStart
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import cut_back
@@ -82,11 +82,9 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
         hint = f"no {path.name} there; name the folder of an accerl train run"
         raise InputError("path", str(path.parent), hint)
     with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
+        for line in file:
             if line.endswith(b"\n"):
-                with reading("path", str(path), f"line {number}"):
-                    entry = _entry(json.loads(line))
-                yield entry
+                yield _entry(json.loads(line))
 
 
 def _entry(line: dict[str, Any]) -> JournalEntry:

@@ -74,9 +74,8 @@ def record_play(config: RunConfig, root: Path, console: Console, load: Load | No
             spec = environment.spec
         dataset = stack.enter_context(record.new_dataset(folder, "accerl/play", spec, config.env))
         disturbed = stack.enter_context(record.simulated(config.env, expert, range(expert_episodes)))
-        by_expert = (episode for episode, _ in disturbed)
         by_policy = policy_play(config, policy_episodes, load)
-        for episode in itertools.chain(by_policy, by_expert):
+        for episode in itertools.chain(by_policy, disturbed):
             record.save_episode(dataset, episode, tally)
             stage.update(tally["episodes"], f"{tally['successes']} successes")
     console.say("{episodes} episodes of play, {successes} successes".format(**tally))

@@ -44,7 +44,6 @@ from accerl_lerobot.policies.features import (
     resizes,
 )
 from accerl_lerobot.rollout.runner import nonfinite
-from accerl_lerobot.run.sizes import check_memory
 from accerl_lerobot.world_model.config import SimulatorStateConfig
 
 if TYPE_CHECKING:
@@ -133,11 +132,11 @@ def check_device(config: RunConfig) -> None:
         raise InputError("policy.device", config.policy.device, hint)
 
 
-def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[EnvironmentSpec, int]:
+def check_start(config: RunConfig, say: Callable[[str], object] = str) -> EnvironmentSpec:
     """Refuse a run that cannot begin, or whose policy could not be used, as far as this is known before it.
 
     Returns:
-        The spec of the environment, and the policy's ``n_obs_steps``.
+        The spec of the environment.
     """
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.config import check_likelihood, sampler_config
@@ -162,9 +161,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         new = config.policy.path is None and config.sft.init_path is None
         field = "sft.policy.type" if new else "policy.type"
         check_likelihood(algorithm.type, sampler_config(config.policy, policy.type), policy.type, field)
-    check_memory(config)
     spec = check_environment(config.env, config.rollout.reward_model)
-    history = int(policy.n_obs_steps)
     meta = None
     if config.policy.path is None:
         trained = policy if config.sft.init_path is None else sft_policy(config.sft)
@@ -176,8 +173,8 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         if meta is None and config.dataset.repo_id is not None:
             meta = open_metadata(config.dataset)
         if meta is not None:
-            _check_remembered(config, spec, meta, history)
-    return spec, history
+            _check_remembered(config, spec, meta, int(policy.n_obs_steps))
+    return spec
 
 
 def check_off_policy(config: RunConfig, policy: Any, spec: EnvironmentSpec) -> None:

@@ -19,7 +19,7 @@ from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
 from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, decode, encode
-from accerl_lerobot.errors import InputError, make_folder, reading
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.replay.journal import EPISODES
 
@@ -39,9 +39,8 @@ def warm_started(directory: Path) -> Path | None:
     note = directory / WARM_START
     if not note.is_file():
         return None
-    with reading("config_path", str(directory), WARM_START):
-        content = json.loads(note.read_text())
-        return directory / str(content["policy"])
+    content = json.loads(note.read_text())
+    return directory / str(content["policy"])
 
 
 def resume_command(directory: Path, config: RunConfig) -> str:
@@ -151,7 +150,7 @@ def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
     Gives a file descriptor to hand to child processes that are to keep it locked. If another process has
     locked it, the error names `field`, and `in_use` as the hint.
     """
-    make_folder(directory, field, again=True)
+    directory.mkdir(parents=True, exist_ok=True)
     with (directory / LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -39,15 +39,7 @@ from accerl_lerobot.engines import Engine, ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
-from accerl_lerobot.errors import (
-    InputError,
-    check_absent,
-    expanded,
-    is_full,
-    kept_traceback,
-    make_folder,
-    printable,
-)
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, printable
 from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
@@ -57,7 +49,6 @@ from accerl_lerobot.run import resuming
 from accerl_lerobot.run.adapter import demonstrations_of, make_adapter
 from accerl_lerobot.run.loop import Loop, Recorder, Times, run_plans
 from accerl_lerobot.run.preflight import check_device, check_environment, check_policy, check_start
-from accerl_lerobot.run.sizes import check_memory
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
 from accerl_lerobot.world_model.config import ImaginationConfig
@@ -79,7 +70,7 @@ def make_output_dir(config: Any) -> Path:
         path = expanded(config.output_dir, "output_dir")
     check_absent(path)
     check_disk(config.output_dir)
-    make_folder(path, "output_dir")
+    path.mkdir(parents=True)
     return path
 
 
@@ -109,7 +100,6 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
 
     with ray_session.opened(config.launch):
         check_device(config)
-        check_memory(config)
         spec = check_environment(config.env, config.rollout.reward_model)
         config = replace(config, policy=pinned(config.policy))
         history = check_policy(config, spec)
@@ -289,7 +279,7 @@ class Run:
         config = self.config
         if self.load is None:
             checked = replace(config, output_dir=None)  # the folder is there by now
-            self.spec, _ = check_start(checked, self.console.say)
+            self.spec = check_start(checked, self.console.say)
         else:
             self.spec = check_environment(config.env)
         check_placement(config)

@@ -28,7 +28,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
 from accerl_lerobot.config.ranges import RunsConfig
-from accerl_lerobot.errors import InputError, expanded, reading
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.fault_points import fault_point
 
 STATES = (
@@ -213,13 +213,12 @@ def read_timeline(run_directory: Path) -> Timeline:
     """Reads what the workers of a run have left, on the axis of the calendar.
 
     Raises:
-        InputError: there is none, or a file of it is damaged.
+        InputError: there is none.
     """
     check_folder(run_directory, FileSource("runs", str(run_directory)))
     processes: dict[str, list[Row]] = {}
     for path in sorted((run_directory / TIMELINE).glob(f"*{SUFFIX}")):
-        with reading("runs", str(run_directory), f"{TIMELINE}/{path.name}"):
-            row = _read_process(path)
+        row = _read_process(path)
         if len(row.states):
             processes.setdefault(row.worker, []).append(row)
     if not processes:

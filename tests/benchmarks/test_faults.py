@@ -26,8 +26,7 @@ from tests.replay.segments import make_segment
 def logged(folder: Path, updates: list[int], inserted: int) -> Victim:
     """A run that ended, by its files alone."""
     folder.mkdir()
-    books = {"replay_inserted_segments": inserted, "replay_stored_segments": 3, "replay_evicted_segments": 4}
-    books["replay_retired_segments"] = 2
+    books = {"replay_inserted_segments": inserted, "replay_stored_segments": 3, "replay_removed_segments": 6}
     records: list[dict[str, Any]] = [{"kind": "train", "update": number} for number in updates]
     lines = [json.dumps(record) for record in [*records, {"kind": "rollout", **books}]]
     (folder / "metrics.jsonl").write_text("\n".join(lines) + '\n{"kind": "train", "up')

@@ -32,7 +32,7 @@ HUB = DatasetConfig(repo_id="a/b")
 LOCAL = DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(ROOT))
 CAMERA = "observation.images.corner2"
 TINY = SFTConfig(
-    steps=2, batch_size=4, num_threads=1, backbone=BackboneConfig(hidden=32, patch=8, image=32),
+    steps=2, batch_size=4, num_threads=1, backbone=BackboneConfig(hidden=32, patch=8),
     policy={
         "type": "smolvla", "num_vlm_layers": 2, "num_expert_layers": 2, "chunk_size": 4, "n_action_steps": 4,
         "max_state_dim": 4, "max_action_dim": 4, "resize_imgs_with_padding": [32, 32], "num_steps": 2,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
-import imageio.v2 as imageio
+import av
 import numpy as np
 import pytest
 
@@ -124,7 +124,8 @@ def test_before_beside_after_with_outcomes(tmp_path: Path) -> None:
     before = [filmed(i, i == 0, grey) for i in (1, 0, 2)] + [filmed(3, True, [])]
     after = [filmed(i, i != 2, grey) for i in range(4)]
     before_after(tmp_path / "film.mp4", before, after, fps=4)
-    film = np.stack([np.asarray(each, int) for each in imageio.get_reader(tmp_path / "film.mp4")])
+    with av.open(tmp_path / "film.mp4") as file:
+        film = np.stack([each.to_ndarray(format="rgb24").astype(int) for each in file.decode(video=0)])
     half = 2 * 64 + GAP
     assert film.shape[1:3] == (half, 2 * half + 4 * GAP)
 

@@ -63,11 +63,17 @@ def write_policy(
 
 def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
-    from accerl_lerobot.demos.backbone import Sizes, write_backbone
+    from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 
-    vision = {"vision_hidden": 16, "vision_layers": 1, "vision_heads": 2, "patch": 8, "image": image}
-    sizes = Sizes(hidden=32, heads=2, kv_heads=1, **vision)
-    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", ["Match the target"], sizes)
+    heads = {"num_attention_heads": 2, "num_key_value_heads": 1}
+    vision = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    backbone = write_backbone(
+        directory.parent / f"{directory.name}-backbone",
+        ["Match the target"],
+        BackboneConfig(hidden=32, patch=8),
+        text=heads,
+        vision=vision | {"image_size": image},
+    )
     return {
         "image": image,
         "vlm_model_name": str(backbone),

@@ -110,7 +110,7 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
         ("smolvla", {}, {"n_action_steps": 6}, "policy.n_action_steps=6: smolvla: at most 5 rows of"),
         ("diffusion", {}, {"n_action_steps": 8}, "policy.n_action_steps=8: diffusion: at most 7 rows of"),
         ("diffusion", {}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was"),
-        ("act", {"temporal_ensemble_coeff": 0.1, "n_action_steps": 1}, {}, "policy.temporal_en.*use null"),
+        ("act", {"temporal_ensemble_coeff": 0.1, "n_action_steps": 1}, {}, "policy.temporal_en.*to null"),
         ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian or chunk_n"),
     ],
 )  # fmt: skip

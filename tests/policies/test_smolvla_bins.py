@@ -30,7 +30,7 @@ SFT = SFTConfig(
         "type": "smolvla_bins", "num_vlm_layers": 2, "chunk_size": 4, "n_action_steps": 3, "num_bins": 32,
         "resize_imgs_with_padding": [32, 32], "freeze_vision_encoder": False,
     },
-    backbone=BackboneConfig(hidden=32, patch=8, image=32),
+    backbone=BackboneConfig(hidden=32, patch=8),
 )  # fmt: skip
 
 

@@ -34,8 +34,8 @@ def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: 
 def assert_books_balance(replay: Replay) -> None:
     """All that came in is here or gone, and no segment is drawn more often than it may."""
     c, entries = replay.counters, replay._entries
-    assert c.inserted_segments == len(entries) + c.evicted_segments + c.retired_segments
-    assert c.inserted_decisions == replay.stored_decisions + c.evicted_decisions + c.retired_decisions
+    assert c.inserted_segments == len(entries) + c.removed_segments
+    assert c.inserted_decisions == replay.stored_decisions + c.removed_decisions
     assert replay.stored_decisions == sum(len(e.segment) for e in entries)
     assert c.unique_decisions <= c.trained_decisions
     assert replay.stored_decisions <= replay.config.capacity

@@ -75,7 +75,7 @@ def test_sample_that_finds_everything_too_old_lets_rollouts_in_and_waits_on():
         assert await waits(late := start(worker.insert([make_segment("new", 8, version=9)])))
         segments = await worker.sample(BATCH, trainer_version=9)
         assert [s.key for s in segments] == ["new"] and await late
-        assert (await worker.metrics())["retired_segments"] == 1
+        assert (await worker.metrics())["removed_segments"] == 1
 
     play(scene, ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=8, max_lag=3))
 
