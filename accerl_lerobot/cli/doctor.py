@@ -30,16 +30,14 @@ DISK_GIB = 2.0  # space that demonstrations, checkpoints and videos of a run may
 ADAMW_COPIES = 3  # of the trained weights: the gradient and the two moments
 RENDER_TIMEOUT_S = 120
 DRAW = """
-from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
+from accerl_lerobot.envs.graphics import Renderers, import_mujoco
 mujoco = import_mujoco()
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 0 3'/><geom size='.3' rgba='1 0 0 1'/></worldbody></mujoco>"
 )
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
-renderer = new_renderer(model, 64, 64)
-renderer.update_scene(data)
-if renderer.render().std() <= 1:
+if Renderers(model).draw(64, 64, data).std() <= 1:
     raise SystemExit("MuJoCo draws an empty picture; set MUJOCO_GL to osmesa or egl")
 """
 
