@@ -122,7 +122,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     score = torch.no_grad()(lambda: adapter.evaluate(*observations, latent).log_prob)
     measure("score", score)
     change = (score() - old).sum(1)
-    optimizer = torch.optim.AdamW(adapter.trainable().values(), lr=1e-6)
+    optimizer = torch.optim.AdamW(adapter.trainable().values(), lr=1e-6, fused=True)
 
     def update() -> None:
         optimizer.zero_grad(set_to_none=True)

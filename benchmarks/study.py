@@ -185,7 +185,7 @@ def _run(config: BenchStudyConfig, cell: Cell, start: RunConfig, made: Path, fol
         if start.dataset.repo_id is None:
             options += [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={made / DEMOS}"]
     run = _parsed(config, cell, folder, options)
-    if cell.hold_back >= run.replay.max_lag:
+    if cell.hold_back and cell.hold_back >= run.replay.max_lag:
         hint = f"use more than trainer.hold_back, {cell.hold_back}, or all is thrown away as too old"
         raise InputError("replay.max_lag", run.replay.max_lag, hint)
     return run

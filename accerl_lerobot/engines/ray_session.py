@@ -150,7 +150,7 @@ def _join(address: str) -> None:
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
         environment = {"env_vars": forwarded_environment()}
         ray.init(address=address, log_to_driver=False, configure_logging=False, runtime_env=environment)
-    except (RuntimeError, OSError, ValueError, AuthenticationError) as error:
+    except (RuntimeError, OSError, ValueError, OverflowError, AuthenticationError) as error:
         reason = in_one_line(error.__cause__ or error)
         hint = f"this process cannot join it; is it what ray start --head printed? {reason}"
         raise InputError("launch.address", address, hint) from error

@@ -60,6 +60,8 @@ class SimulatedConfig(EnvConfig):
         super().__post_init__()
         if not self.tasks or not INSTRUCTIONS.keys() >= set(self.tasks):
             raise InputError("env.task", self.task, f"use names from: {', '.join(INSTRUCTIONS)}")
+        if self.hold > self.max_steps:  # or nothing would ever succeed
+            raise InputError("env.hold", self.hold, f"use 1 to env.max_steps ({self.max_steps})")
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -183,6 +183,7 @@ STEPS = (
 """Names of LeRobot's policy configs for the number of denoising steps."""
 DTYPES = ("dtype", "model_dtype", "torch_dtype", "vlm_dtype")
 """Names of LeRobot's policy configs for the type of the weights."""
+COARSE = ("auto", "bfloat16", "float16")  # types of weights in which small steps of RL are lost
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -305,7 +306,8 @@ def override(policy_config: Any, config: PolicyConfig, *, learns: bool = False) 
         "compile_model": False,  # a compiled sampler rounds unlike the re-scoring pass
     }
     if learns or policy_config.type in POLICIES:
-        fixed |= dict.fromkeys(DTYPES, "float32")
+        coarse = [name for name in DTYPES if getattr(policy_config, name, None) in COARSE]
+        fixed |= dict.fromkeys(coarse, "float32")
     for name, value in fixed.items():
         if hasattr(policy_config, name):
             setattr(policy_config, name, value)

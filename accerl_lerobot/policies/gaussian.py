@@ -114,7 +114,7 @@ class ACT(GaussianModel):
         config = policy.config
         if config.temporal_ensemble_coeff is not None:
             hint = "averaging over earlier chunks makes actions depend on more than the observation; "
-            hint += "set it to null in config.json"
+            hint += "set it to null in the config.json of a copy"
             raise NoDensityError("policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, hint)
         self.executed = config.n_action_steps
         self.action_dim = config.action_feature.shape[0]

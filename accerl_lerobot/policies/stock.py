@@ -30,12 +30,13 @@ from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
 from accerl_lerobot.policies.family import Latent
 from accerl_lerobot.policies.features import ACTION
-from accerl_lerobot.policies.processing import Processing
+from accerl_lerobot.policies.processing import CONSTANT, Processing
 from accerl_lerobot.seeds import decision_of, episode_of
 
 logger = logging.getLogger(__name__)
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
+ROUNDED = 0.01  # largest error of an action that went to environment units and back
 NOISE = 6  # distinguishes the seeds of the noise on executed chunks
 
 
@@ -78,7 +79,8 @@ class StockAdapter(PretrainedAdapter):
         in the policy's networks, and `reset` removes them, the networks hold the state of one episode.
         """
         networks = [vars(module) for module in self.policy.modules() if module is not self.policy]
-        self._act(self.policy, self.example_requests()[0])
+        action = self._act(self.policy, self.example_requests()[0])
+        self.processing.unnormalise(action)
         acted = tensors_in(networks)
         self.policy.reset()
         self._one_at_a_time = acted > tensors_in(networks)
@@ -98,7 +100,8 @@ class StockAdapter(PretrainedAdapter):
         """Proves that the policy can be asked twice for a chunk, and that its training loss can be computed.
 
         Raises:
-            InputError: it answers the same question differently, or is trained on more than its chunks.
+            InputError: it answers the same question differently, is trained on more than its chunks, or its
+                preprocessor does not undo what its postprocessor does to actions.
         """
         config = self.policy.config
         coarse = sum(tensor.dtype == torch.bfloat16 for tensor in self.trainable().values())
@@ -130,11 +133,23 @@ class StockAdapter(PretrainedAdapter):
                 reason,
             )
         chunk = torch.zeros(len(requests), *first.shape, device=self.device)
+        self._check_targets(requests, chunk)
         buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
         with torch.no_grad(), torch.random.fork_rng(), self.autocast():
             self.imitate(*stack_observations(requests), chunk)
             for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
                 buffer.copy_(buffers[name])
+
+    def _check_targets(self, requests: Sequence[Request], zeros: Tensor) -> None:
+        """Refuses a policy that would be trained on other chunks (B, K, A) than it is told to imitate."""
+        _, scale = self.processing.units(zeros[0, :1])
+        varies = scale[0].abs() > CONSTANT
+        for value in (-0.5, 0.5):
+            prepared = self._training_batch(*stack_observations(requests), zeros + value)[ACTION]
+            error = prepared[..., : len(varies)].float() - value
+            if error[..., varies].abs().max() > ROUNDED:
+                hint = "LeRobot's preprocessor does not undo what its postprocessor does to actions; it can"
+                raise InputError("policy.type", self.policy.config.type, f"{hint} be evaluated (accerl eval)")
 
     def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         self._refuse()

@@ -26,6 +26,7 @@ from accerl_lerobot.experience import Request, stack_observations
 from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, TuningConfig, override
 from accerl_lerobot.policies.features import policy_features
 from accerl_lerobot.policies.loading import load_acting, load_adapter
+from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
 from tests.policies.checkpoints import (
@@ -481,4 +482,18 @@ def test_a_policy_that_changes_while_it_acts_is_refused(written: Any, monkeypatc
     with pytest.raises(
         InputError, match="policy.type='vqbet': asked twice with the same noise, it gives two"
     ):
+        learning(written("vqbet"))
+
+
+def test_actions_that_lerobot_does_not_bring_back_are_refused(written: Any, monkeypatch: pytest.MonkeyPatch):
+    """Such as a gripper that the postprocessor opens or closes whole."""
+    stock = Processing.unnormalise
+
+    def whole(self: Processing, chunk: torch.Tensor) -> torch.Tensor:
+        actions = stock(self, chunk).clone()
+        actions[..., -1] = torch.where(actions[..., -1] > 0, -1.0, 1.0)
+        return actions
+
+    monkeypatch.setattr(Processing, "unnormalise", whole)
+    with pytest.raises(InputError, match="policy.type='vqbet': LeRobot's preprocessor does not undo"):
         learning(written("vqbet"))
