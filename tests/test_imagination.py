@@ -23,10 +23,11 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
-from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
+from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.run.train import Run
 from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.config import (
@@ -312,3 +313,15 @@ def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
     assert {episode.key for episode in recorded} > set(learnt)
     saved = read_content(tmp_path / "checkpoints" / "last" / WORLD_MODEL)["learnt"]
     assert len(saved) == len(learnt) + 6, "and the real episodes of the run"
+
+
+def test_a_process_that_takes_anothers_place_imagines_from_its_episodes(world_model: Path):
+    """Although its real episodes have all been played, and it has seen none of them."""
+    imagination = ImaginationConfig(environments=1, path=str(world_model))
+    worker = RolloutWorker(ENV, RolloutConfig(environments=1), imagination=imagination)
+    worker.ready(EpisodePlans(("match",), 0, budget=0), [("match", 5)])
+    worker.report(True, [])
+    plan = worker._next(IMAGINED)
+    assert worker._next(REAL) is None and plan is not None and plan.task == "match"
+    first, real = worker._environments[1].reset(plan.seed, "match"), make_environment(ENV).reset(5, "match")
+    assert np.array_equal(first["observation.images.front"], real["observation.images.front"])

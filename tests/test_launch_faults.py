@@ -20,13 +20,14 @@ from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.evaluation import evaluation_plans
+from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.victims import alive
-from tests.light_workers import FULL, HANGS, WarningRollout
+from tests.light_workers import FULL, HANGS, LightInference, WarningRollout
 from tests.runs import collect, drive, eventually, polls, until
 
 SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
@@ -208,3 +209,26 @@ def test_a_run_in_which_nothing_moves_ends_but_not_while_resets_are_slow(engine)
     until_training(one)
     ray.get(one._trainer.actor.idle.remote())  # rollouts fill replay up, then wait
     assert "raise launch.stall_s" in until_failure(one)
+
+
+@pytest.mark.slow
+def test_an_inference_is_replaced_before_there_are_weights_but_must_start(engine, monkeypatch, tmp_path):
+    note = tmp_path / "started"
+
+    class StartsTwice(LightInference):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            starts = note.read_text() if note.exists() else ""
+            if len(starts) == 2:
+                raise MemoryError("no room for the policy")
+            note.write_text(starts + "x")
+
+    monkeypatch.setattr(inference_worker, "InferenceWorker", StartsTwice)
+    one = engine(rollout=TWO, trainer=ENDLESS)
+    one.plan(evaluation_plans(("match",), 4, "before"))
+    os.kill(one.pids()["inference"], signal.SIGKILL)
+    assert {r.versions for r in collect(one, "before", 4)} == {(0, 0)}
+    until_training(one)
+    os.kill(one.pids()["inference"], signal.SIGKILL)
+    text = until_failure(one)
+    assert text.startswith("inference worker did not start again:") and "no room for the policy" in text

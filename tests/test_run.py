@@ -2,6 +2,7 @@
 """A run from its command to its summary, in one process."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,10 +15,12 @@ from accerl_lerobot.engines import Engine, Progress, Saved
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation import EvaluationConfig
+from accerl_lerobot.errors import warn_once
+from accerl_lerobot.evaluation import EvaluationConfig, evaluation_plans
 from accerl_lerobot.rollout.runner import EpisodePlan
 from accerl_lerobot.run import loop
 from accerl_lerobot.run import train as run
+from accerl_lerobot.run.loop import run_plans
 from tests.rollout.environments import ended
 from tests.runs import records, tiny_run
 
@@ -264,3 +267,16 @@ def test_a_run_that_fails_closes_the_engine_and_keeps_its_own_error(
     assert caught.value is error and engine.closed
     assert len(records(tmp_path, "evaluation")) == 1, "what was measured before is kept"
     assert not (tmp_path / "summary.json").exists()
+
+
+def test_a_note_is_told_at_its_first_episode(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    warn_once.cache_clear()
+    plan = evaluation_plans(("match",), 1, "eval")[0]
+    noted = replace(ended(plan), note="env.success='won': no such key")
+    engine = Scripted(local_run(tiny_checkpoint, tmp_path))
+    monkeypatch.setattr(engine, "poll", lambda: Progress(version=0, episodes=[noted, noted]))
+    for _ in range(2):
+        run_plans(engine, 4, "eval", Console())
+    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [noted.note]

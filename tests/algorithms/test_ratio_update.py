@@ -360,3 +360,14 @@ def test_the_live_weights_are_back_in_their_own_memory_whatever_happens(monkeypa
         probe.read(batch)
     assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())
     assert adapter.weight.data_ptr() == place and adapter.weight.grad is None
+
+
+def test_a_version_that_never_acted_is_given_up_for_the_newest():
+    update = make_update(PROBED)
+    later = [decided_by(update.adapter, make_segments((4, 4, 4), seed=i), 0) for i in range(2)]
+    for segments in later:
+        segments[0].version[:], segments[1].version[:], segments[2].version[:] = -3, -2, 1
+    assert read(update.step(later[0])) is None and update._probe._version == 0
+    later[1][1].version[:] = 1  # now most of the batch is newer than version 0
+    assert read(update.step(later[1])) is None and update._probe._version == 2
+    assert read(update.step(fresh(update))) == pytest.approx([0.0] * 3, abs=1e-4)

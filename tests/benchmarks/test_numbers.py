@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from accerl_lerobot.engines.config import encode
 from accerl_lerobot.envs import make_environment
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate
 from benchmarks import async_vs_sync, simulated_environment
 from benchmarks.async_vs_sync import ARMS
 from benchmarks.async_vs_sync import compare as compare_schedules
+from benchmarks.gpu import BenchGpuConfig, bench_gpu
 from benchmarks.latency import described
 from benchmarks.machinery import MachineryConfig
 from benchmarks.simulated_environment import LatencyConfig, read_trace
@@ -151,3 +154,9 @@ def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path: Path, 
             assert draws[(draws.index(1.0) + 1) % 3] == 2.0
         starts.add(draws[0])
     assert starts == {1.0, 2.0, 6.0}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_says_so_before_anything_is_measured(tmp_path: Path):
+    with pytest.raises(InputError, match="no CUDA device here"):
+        bench_gpu(BenchGpuConfig(output_dir=str(tmp_path)))
