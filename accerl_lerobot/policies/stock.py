@@ -147,7 +147,7 @@ class StockAdapter(PretrainedAdapter):
         for value in (-0.5, 0.5):
             prepared = self._training_batch(*stack_observations(requests), zeros + value)[ACTION]
             error = prepared[..., : len(varies)].float() - value
-            if error[..., varies].abs().max() > ROUNDED:
+            if (error[..., varies].abs() > ROUNDED).any():
                 hint = "LeRobot's preprocessor does not undo what its postprocessor does to actions; it can"
                 raise InputError("policy.type", self.policy.config.type, f"{hint} be evaluated (accerl eval)")
 

@@ -497,3 +497,9 @@ def test_actions_that_lerobot_does_not_bring_back_are_refused(written: Any, monk
     monkeypatch.setattr(Processing, "unnormalise", whole)
     with pytest.raises(InputError, match="policy.type='vqbet': LeRobot's preprocessor does not undo"):
         learning(written("vqbet"))
+
+
+def test_actions_of_which_none_varies_are_no_reason_to_refuse(written: Any, monkeypatch: pytest.MonkeyPatch):
+    stock = Processing.unnormalise
+    monkeypatch.setattr(Processing, "unnormalise", lambda self, chunk: 0 * stock(self, chunk) + 0.3)
+    learning(written("vqbet"))
