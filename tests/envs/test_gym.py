@@ -160,22 +160,6 @@ def test_success_is_read_by_its_key_and_ends_the_episode(key: str, told: dict[st
     assert "it has no keys" in ended(odd()).note
 
 
-@pytest.mark.parametrize(
-    ("method", "older", "message"),
-    [
-        ("reset", lambda full: full[0], r"let its reset return \(observation, info\)"),
-        ("step", lambda full: (*full[:3], full[4]), r"let its step return \(observation, reward"),
-    ],
-)
-def test_an_environment_of_the_older_interface_is_told_what_to_return(
-    method: str, older: Any, message: str, monkeypatch: pytest.MonkeyPatch
-):
-    full = getattr(Odd, method)
-    monkeypatch.setattr(Odd, method, lambda *args, **options: older(full(*args, **options)))
-    with pytest.raises(InputError, match=f"^env.id='Odd-v0': {message}"):
-        ended(odd())
-
-
 def test_the_environment_has_its_own_limit():
     assert make_environment(odd()).spec.max_steps == 7
     assert make_environment(odd(max_steps=3)).spec.max_steps == 3
