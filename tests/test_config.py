@@ -56,6 +56,9 @@ class TestOverrides:
         assert parse(RunConfig, [recipe, "--algorithm.type=gipo"]).algorithm.sigma == 0.5
         config = parse(RunConfig, [recipe, "--env.type=metaworld", "--env.task=door-open-v3"])
         assert config.env == MetaWorldConfig(task="door-open-v3", image_size=64)
+        config = parse(RunConfig, ["few_shot", "--sft.policy={type: vqbet, crop_shape: [64, 64]}"])
+        assert config.sft.policy == {"type": "vqbet", "crop_shape": [64, 64]}, "none of SmolVLA's fields"
+        assert parse(RunConfig, ["few_shot", "--sft.policy.num_steps=5"]).sft.policy["num_vlm_layers"] == 2
 
     def test_values_are_yaml(self) -> None:
         arguments = ["--seed", "4", "--resume=true", "--trainer.betas=[0.8, 0.9]"]

@@ -357,7 +357,8 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     """`tree` with `given` laid over it.
 
     Where `given` picks another type than the file's, the new type takes over the fields that it has and whose
-    values fit: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``.
+    values fit: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``. Of a policy type of
+    LeRobot's the fields are not known here, so another ``sft.policy.type`` replaces all of them.
     """
     merged = tree | given
     sections = sections_of(config_class)
@@ -367,8 +368,9 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         over = given[name]
         if not isinstance(under, dict) or not isinstance(over, dict):
             continue
-        if name not in sections:
-            merged[name] = under | over
+        if name not in sections:  # fields of LeRobot's or of a simulator's, such as `sft.policy`
+            other = over.get(TYPE, under.get(TYPE)) != under.get(TYPE)
+            merged[name] = over if other else under | over
             continue
         section = sections[name]
         former = under.get(TYPE, getattr(defaults[name], TYPE, None))
