@@ -20,6 +20,7 @@ from benchmarks.faults import BenchFaultsConfig
 from benchmarks.gpu import BenchGpuConfig
 from benchmarks.latency import BenchLatencyConfig
 from benchmarks.policy import BenchPolicyConfig
+from benchmarks.samplers import BenchSamplersConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.study import BenchStudyConfig
 from benchmarks.third_party import BenchThirdPartyConfig
@@ -29,6 +30,7 @@ from benchmarks.transport import BenchTransportConfig
 CONFIGS: dict[str, type[Any]] = {
     "environment": BenchEnvironmentConfig,
     "policy": BenchPolicyConfig,
+    "samplers": BenchSamplersConfig,
     "throughput": BenchThroughputConfig,
     "study": BenchStudyConfig,
     "faults": BenchFaultsConfig,
