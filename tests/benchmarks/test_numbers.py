@@ -13,12 +13,14 @@ from accerl_lerobot.engines.config import encode
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate
+from accerl_lerobot.policies.config import PolicyConfig
 from benchmarks import async_vs_sync, simulated_environment
 from benchmarks.async_vs_sync import ARMS
 from benchmarks.async_vs_sync import compare as compare_schedules
 from benchmarks.gpu import BenchGpuConfig, bench_gpu
 from benchmarks.latency import described
 from benchmarks.machinery import MachineryConfig
+from benchmarks.samplers import BenchSamplersConfig, bench_samplers
 from benchmarks.simulated_environment import LatencyConfig, read_trace
 from benchmarks.study import BenchStudyConfig, bench_study, together
 from benchmarks.tables import mean_interval
@@ -101,6 +103,17 @@ def test_a_study_is_run(tmp_path: Path, tiny_checkpoint: Path):
     assert {"study.json", "study.md", "study.png", "rollout.episodes=8-seed3"} < {
         p.name for p in folder.iterdir()
     }
+
+
+def test_a_type_with_a_likelihood_is_timed_with_and_without_it(tiny_checkpoint: Path):
+    config = BenchSamplersConfig(
+        policy=PolicyConfig(path=str(tiny_checkpoint), device="cpu"), environments=2, batch=3, repeats=2
+    )
+    result = bench_samplers(config)
+    own, any_type = result["seconds"]["own likelihood"], result["seconds"]["chunk_noise"]
+    for part in ("decide_one", "decide", "step"):
+        assert len(own[part]["blocks"]) == len(any_type[part]["blocks"]) == 2
+        assert result["ratio"][part] == any_type[part]["median"] / own[part]["median"]
 
 
 def test_durations_by_hand():
