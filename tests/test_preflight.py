@@ -246,6 +246,23 @@ def test_a_camera_that_the_policy_does_not_read_is_not_judged(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
+    ("field", "least", "name"), [("max_state_dim", 4, STATE), ("max_action_dim", 2, "action")]
+)
+def test_more_numbers_than_a_policy_pads_to_are_refused(field: str, least: int, name: str, tmp_path: Path):
+    dataset = write_dataset(tmp_path / "data", more={FRONT: IMAGE})
+    spec = make_environment(SimulatedConfig()).spec
+
+    def check(size: int) -> None:
+        sft = SFTConfig(steps=1, policy={"type": "smolvla", field: size})
+        check_training_data(sft, dataset, check_sft_policy(sft), spec, {})
+
+    check(least)
+    why = f"sft.policy.{field}={least - 1}: {name} has {least} numbers; use {least}"
+    with pytest.raises(InputError, match=why):
+        check(least - 1)
+
+
+@pytest.mark.parametrize(
     ("features", "without", "why"),
     [
         ({"observation.state.joints": VECTOR}, STATE, r"it is in parts \(observation.state.joints\)"),

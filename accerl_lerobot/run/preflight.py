@@ -262,6 +262,7 @@ def check_training_data(
             # Its cameras may have names of their own.
             vectors = {name: shape for name, shape in data.shapes.items() if name in (STATE, ACTION)}
             check_features(replace(data, shapes=vectors), offered, {}, *about)
+    _check_padding(policy, needs, sft)
     if meta is not None and spec is not None:
         with opened(dataset, meta, picked(dataset, sft.pick)) as read:
             check_actions(numbers(read, ACTION, dataset), spec, *about)
@@ -277,6 +278,19 @@ def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) 
     if ACTION not in source.shapes:
         raise InputError(*about, f"no {ACTION}, so that there is nothing to imitate; name another dataset")
     return replace(source, shapes=(named or source.shapes) | {ACTION: source.shapes[ACTION]})
+
+
+def _check_padding(policy: Any, needs: Features, sft: SFTConfig) -> None:
+    """Refuse a policy that pads to fewer numbers than there are: LeRobot would build it and fail in a step."""
+    for field, name in (("max_state_dim", STATE), ("max_action_dim", ACTION)):
+        most = getattr(policy, field, None)
+        (size,) = needs.shapes.get(name, (0,))
+        if most is None or size <= most:
+            continue
+        hint = f"{name} has {size} numbers"
+        if sft.init_path is not None:
+            raise InputError("sft.init_path", sft.init_path, f"its {field} is {most}, but {hint}")
+        raise InputError(f"sft.policy.{field}", most, f"{hint}; use {size}")
 
 
 def check_wandb(config: WandBConfig) -> None:
