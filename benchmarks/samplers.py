@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cost of a checkpoint's decisions and steps: with its own likelihood, and as a policy of any type.
 
-A type without a likelihood has the second column alone. The two take turns, so that a busy machine slows both.
+A type without a likelihood has the second column alone. The two take turns, so a busy machine slows both.
 """
 
 from __future__ import annotations

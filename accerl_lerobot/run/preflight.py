@@ -281,7 +281,7 @@ def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) 
 
 
 def _check_padding(policy: Any, needs: Features, sft: SFTConfig) -> None:
-    """Refuse a policy that pads to fewer numbers than there are: LeRobot would build it and fail in a step."""
+    """Refuse a policy that pads to fewer numbers than there are: LeRobot would fail in the first step."""
     for field, name in (("max_state_dim", STATE), ("max_action_dim", ACTION)):
         most = getattr(policy, field, None)
         (size,) = needs.shapes.get(name, (0,))
