@@ -54,6 +54,7 @@ class Request:
     noise_seed: int
     elapsed: float = 0.0  # share of the episode's time limit that is gone
     explore: bool = True  # False asks for LeRobot's stock sampler, the one evaluation uses
+    task: str = ""  # the environment's name of the task; two tasks may have one instruction
 
 
 @kind

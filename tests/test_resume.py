@@ -30,6 +30,7 @@ from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import preflight, resuming
 from accerl_lerobot.run.resuming import resume_command
+from accerl_lerobot.run.train import Run
 from tests.policies.checkpoints import write_policy
 from tests.runs import records as logged
 from tests.runs import tiny_run
@@ -228,7 +229,11 @@ def test_a_finished_run_goes_back_to_an_earlier_checkpoint(
     assert go_on(run, config="checkpoints/000010/config.yaml") == 2
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
     monkeypatch.undo()
-    assert go_on(run, config="checkpoints/000010/config.yaml") == 0
+    monkeypatch.setattr(Run, "_practise_once", failing)
+    assert go_on(run, config="checkpoints/000010/config.yaml") == 2
+    assert not (run / "summary.json").exists(), "it tells of the end that was given up"
+    monkeypatch.undo()
+    assert go_on(run) == 0
     assert records(run) == records(whole) and summary(run) == summary(whole)
 
 

@@ -79,10 +79,10 @@ def make_environment(
         environment: Environment = imported(config.environment)(config)
     except Exception as error:
         raise environment_error(config, error) from error
-    if reward_model is not None and reward_model.path is not None:
-        environment = JudgedEnvironment(environment, load_judge(reward_model))
     if history > 1:
-        return HistoryEnvironment(environment, history)
+        environment = HistoryEnvironment(environment, history)
+    if reward_model is not None and reward_model.path is not None:
+        environment = JudgedEnvironment(environment, load_judge(reward_model), history)
     return environment
 
 
@@ -162,16 +162,24 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
 class JudgedEnvironment(WrappedEnvironment):
     """An environment whose successes, and rewards, are those that a reward model sees.
 
-    An episode also ends where the environment itself ends it, successfully or not.
+    It looks at the newest of `history` env steps, once after each chunk. An episode also ends where the
+    environment itself ends it, successfully or not.
     """
 
-    def __init__(self, environment: Environment, succeeded: Callable[[Observation], bool]) -> None:
+    def __init__(
+        self, environment: Environment, succeeded: Callable[[Observation], bool], history: int = 1
+    ) -> None:
         super().__init__(environment)
         self.succeeded = succeeded
+        self._history = history
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         result = self._environment.step_chunk(actions)
-        success = not result.info.get("nonfinite") and self.succeeded(result.observation)
+        newest = dict(result.observation)
+        if self._history > 1:
+            arrays = {name: value for name, value in newest.items() if isinstance(value, np.ndarray)}
+            newest |= {name: value[-1] for name, value in arrays.items()}
+        success = not result.info.get("nonfinite") and self.succeeded(newest)
         rewards = np.zeros_like(result.rewards)
         rewards[-1] = success
         return replace(

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError, in_one_line
-from accerl_lerobot.experience import TASK, Decision, Observations, Request, stack_observations
+from accerl_lerobot.experience import Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
 from accerl_lerobot.policies.family import Latent
@@ -178,18 +178,21 @@ class StockAdapter(PretrainedAdapter):
         """The policy object of the request's episode; new, and reset, if this is its first decision.
 
         Raises:
-            InputError: the policy acts in one environment at a time, and another episode has begun.
+            InputError: the policy acts in one environment at a time, and another episode has begun; or the
+                object of an episode under way is not here.
         """
-        episode = episode_of(request.noise_seed), str(request.observation[TASK])
+        episode = episode_of(request.noise_seed), request.task
         begins = decision_of(request.noise_seed) == 0
         latest = next(reversed(self._episodes), episode)
         if self._one_at_a_time and not begins and latest != episode:
             why = "its networks hold the state of one episode, so it acts in one environment at a time"
             hint = f"{why}; set rollout.workers=1 and rollout.environments=1"
             raise InputError("policy.type", self.policy.config.type, hint)
-        if begins:  # the episode of a lost worker begins once more
-            self._episodes.pop(episode, None)
-        if episode not in self._episodes:
+        if not begins and episode not in self._episodes:
+            why = "what it remembers of an episode is lost: its inference worker was replaced, or more than"
+            hint = f"{why} {EPISODES} environments share one; evaluate again, with more inference.workers"
+            raise InputError("policy.type", self.policy.config.type, hint)
+        if begins:  # perhaps once more, after a rollout worker was lost
             memo = {id(part): part for part in shared_parts(self.policy)}
             self._episodes[episode] = copy.deepcopy(self.policy, memo)
             self._episodes[episode].reset()

@@ -248,6 +248,7 @@ class ActiveEpisode:
             noise_seed=noise_seed(self.plan.seed, len(self.versions)),
             elapsed=self.steps / self.time_limit,
             explore=self.plan.explore,
+            task=self.plan.task,
         )
 
     def add(

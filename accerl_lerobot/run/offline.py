@@ -141,6 +141,7 @@ def _remember(
     config: OfflineRun, update: Any, meta: Any, shapes: dict[str, tuple[int, ...]], console: Console
 ) -> dict[str, Any]:
     """Fill the memory from the dataset; returns the numbers of its episodes, successes and decisions."""
+    from accerl_lerobot.algorithms.chunk_critic import LEAST_TRANSITIONS
     from accerl_lerobot.policies.config import executed_rows
     from accerl_lerobot.run.adapter import recorded
 
@@ -172,6 +173,12 @@ def _remember(
     if not len(update.imitable()) or not (successes or graded):
         hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
+    if isinstance(algorithm, ChunkCriticConfig) and update.state_learner is not None:
+        transitions = int(np.count_nonzero(~update.memory["last"]))
+        if transitions < LEAST_TRANSITIONS:
+            why = f"{transitions} of its decisions are followed by another one in their episode"
+            hint = f"{why}, and the world model learns from {LEAST_TRANSITIONS} or more"
+            raise InputError("algorithm.type", algorithm.type, f"{hint}; lower policy.n_action_steps")
     console.say(", ".join(f"{number} {name}" for name, number in counts.items()))
     return counts
 

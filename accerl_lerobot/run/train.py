@@ -102,9 +102,9 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
         check_device(config)
         spec = check_environment(config.env, config.rollout.reward_model)
         config = replace(config, policy=pinned(config.policy))
-        history = check_policy(config, spec)
         # Nothing is learnt, whatever the recipe says.
         config = replace(config, algorithm=GIPOConfig(), world_model=None, imagination=ImaginationConfig())
+        history = check_policy(config, spec)
         engine = make_engine(config, spec.tasks, history, load=load_acting)
         with closing(engine):
             count = config.evaluation.episodes
@@ -252,6 +252,7 @@ class Run:
             self.config = warm_start(self.config, self.directory, self.console)
         else:
             layout.go_back_to(checkpoint)
+            (self.directory / layout.SUMMARY).unlink(missing_ok=True)  # of a later end, if it had ended
             self.console.say(f"going on from {checkpoint}")
             self.times.before_s = None
         if self.config.imagination.environments and self.config.imagination.path is None:
@@ -370,8 +371,8 @@ class ActingPolicy:
         and ``task``, the instruction. For a policy with ``n_obs_steps`` above 1 each array begins with that
         dimension, oldest first, as ``make_environment(config, policy.history)`` gives them.
         """
-        self._decisions += 1
         seed = noise_seed(self._episode, self._decisions)
+        self._decisions += 1
         request = Request(observation=observation, noise_seed=seed, explore=False)
         return self.adapter.decide([request], version=0)[0].chunk
 

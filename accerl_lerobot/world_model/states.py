@@ -51,7 +51,7 @@ class StateSpec(NamedTuple):
 class Transitions(NamedTuple):
     """B decisions of remembered episodes; none is the last one of its episode."""
 
-    observations: Observations
+    observations: Observations  # the policy's: without ``observation.environment_state``
     following: Observations  # one decision later
     tasks: Sequence[str]  # instructions
     elapsed: Tensor  # float32 (B,), share of the time limit gone

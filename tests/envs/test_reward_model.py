@@ -101,6 +101,18 @@ def test_episodes_succeed_and_end_as_it_says(encoder: Path, tmp_path: Path):
     assert sum(r.steps for r in results) == ENV.max_steps and results[-1].truncated
 
 
+def test_it_looks_once_at_the_newest_of_several_env_steps(encoder: Path, tmp_path: Path):
+    write_classifier(tmp_path, encoder)
+    environment = make_environment(ENV, 2, RewardModelConfig(path=str(tmp_path)))
+    assert isinstance(environment, JudgedEnvironment), "so that a film does not have it asked more often"
+    seen: list[Any] = []
+    environment.succeeded = lambda observation: bool(seen.append(observation))
+    environment.reset(0, "match")
+    result = environment.step_chunk(np.zeros((4, 2), np.float32))
+    (asked,) = seen
+    np.testing.assert_array_equal(asked[CAMERA], result.observation[CAMERA][-1])
+
+
 def test_a_run_learns_from_what_it_says(encoder: Path, tmp_path: Path):
     write_classifier(tmp_path / "always", encoder, 9.0)
     checkpoint = write_smolvla(tmp_path / "policy", image=128)
