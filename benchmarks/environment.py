@@ -145,7 +145,7 @@ def _ours(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Decid
 
 
 def _stock(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Decide:
-    env, left = _stock_env(config.env, config.task), config.env.max_steps
+    env, left = _stock_env(config.env, config.task), config.env.time_limit
     env.reset(seed=0)
 
     def decide() -> int:
@@ -153,10 +153,10 @@ def _stock(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Deci
         _, _, terminated, truncated, _ = env.step(next(chunks)[0])
         left -= 1
         if terminated and not isinstance(config.env, LiberoConfig):  # LeRobot's MetaWorld has reset itself
-            left = config.env.max_steps
+            left = config.env.time_limit
         elif terminated or truncated or not left:
             env.reset(seed=0)
-            left = config.env.max_steps
+            left = config.env.time_limit
         return 1
 
     return decide
@@ -186,7 +186,7 @@ def _put_back(
 
     def decide() -> int:
         step(next(chunks)[0])
-        if next(steps) % config.env.max_steps == 0:
+        if next(steps) % config.env.time_limit == 0:
             sim.set_state(start)
         return 1
 

@@ -181,7 +181,11 @@ def evaluate(arguments: list[str]) -> int:
     console = Console()
     with redirect_stdout(sys.stderr):
         results = run.play_evaluation(whole, console, config.evaluation.videos if out else 0)
-    summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
+    policy = config.policy.path
+    # `last` is another checkpoint after more updates.
+    if policy is not None and Path(policy).expanduser().exists():
+        policy = str(Path(policy).expanduser().resolve())
+    summary: dict[str, Any] = summarise(results) | {"policy": policy}
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))
     if out is not None:

@@ -306,11 +306,16 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(text: str) -> Any:
-    """A value as YAML reads it; text that is not YAML is text."""
+    """A value as YAML reads it; text stays as it is, unless it is quoted."""
     try:
-        return yaml.load(text, _Loader) if text else text
+        value = yaml.load(text, _Loader) if text else text
     except Exception:  # see `read_recipe`
         return text
+    unquoted = isinstance(value, str) and text[0] not in "'\""
+    odd = isinstance(value, int) and not isinstance(value, bool) and str(value) != text
+    if unquoted or odd:  # YAML would cut off what follows a #, and reads 012345 as an octal number
+        return text
+    return value
 
 
 def section_of(annotation: Any) -> type[Any] | None:
@@ -372,6 +377,9 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
             other = over.get(TYPE, under.get(TYPE)) != under.get(TYPE)
             merged[name] = over if other else under | over
             continue
+        places = ("path", "repo_id")
+        if any(place in over and over[place] != under.get(place) for place in places):
+            under = {key: value for key, value in under.items() if key != "revision"}  # of another repository
         section = sections[name]
         former = under.get(TYPE, getattr(defaults[name], TYPE, None))
         chosen = over.get(TYPE, former)

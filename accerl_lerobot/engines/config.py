@@ -177,6 +177,10 @@ class RunConfig(Section):
         if imagined and 0 < rollout.episodes < rollout.workers:
             hint = f"use at least {rollout.workers}: each rollout worker needs a real episode to imagine from"
             raise InputError("rollout.episodes", rollout.episodes, hint)
+        judge = rollout.reward_model.path
+        if imagined and self.imagination.path is None and judge is not None:
+            hint = "the run's own world model learns the environment's successes; give imagination.path"
+            raise InputError("rollout.reward_model.path", judge, hint)
         if self.launch.schedule != ASYNCHRONOUS and (imagined or rollout.episodes):
             hint = "use asynchronous, or leave out imagination.environments and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, hint)

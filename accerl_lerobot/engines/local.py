@@ -20,7 +20,6 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.engines import Engine, Progress, Saved
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Decision, Request, Segment
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.buffer import Replay
@@ -154,9 +153,6 @@ class LocalEngine(Engine):
         return Saved(self._update.version, [])
 
     def _restore(self, directory: Path) -> None:
-        if not (directory / f"{LOCAL}.json").is_file():
-            hint = "this run was asynchronous; resume it with launch.engine=ray"
-            raise InputError("launch.engine", "local", hint)
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
         self._replay.restore(snapshot.load(directory / "replay"))

@@ -294,9 +294,6 @@ def save_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
 
 def restore_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     """Go on from what `save_rollouts` has written."""
-    if not (directory / f"{ROLLOUT}.json").is_file():
-        hint = "this run was in one process; resume it with launch.engine=local"
-        raise InputError("launch.engine", "ray", hint)
     saved = snapshot.load(directory / ROLLOUT)
     if len(saved["slots"]) != len(workers):
         hint = f"this run has {len(saved['slots'])}; leave the field out"

@@ -217,6 +217,11 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     type = registered_name
 
     @property
+    def time_limit(self) -> int:
+        """Env steps of an episode at most; 0: the environment's own limit."""
+        return self.max_steps
+
+    @property
     def tells_state(self) -> bool:
         """True if observations hold ``observation.environment_state``."""
         return bool(getattr(self, "environment_state", None))
@@ -311,7 +316,7 @@ def unit_spec(
         action_low=np.full(action, -1, np.float32),
         action_high=np.full(action, 1, np.float32),
         fps=fps,
-        max_steps=config.max_steps,
+        max_steps=config.time_limit,
         tasks=config.tasks,
         instructions=tuple(map(instruction, config.tasks)),
     )
@@ -394,6 +399,8 @@ def lerobot_eval_arguments(env: Mapping[str, Any], renames: Mapping[str, str]) -
         fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
         if env.get("max_steps"):
             fields["episode_length"] = env["max_steps"]
+        if env.get("discover_packages_path"):
+            fields["discover_packages_path"] = env["discover_packages_path"]
         camera = env.get("camera")
         if camera:  # the name that we give to LeRobot's lone image
             image = f"observation.images.{camera}"

@@ -170,8 +170,6 @@ class LiberoConfig(SuiteConfig):
     of the objects that the task is about, distances between all these, and the share of `max_steps` gone. For
     ``algorithm.type=chunk_critic``."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.max_steps:
-            longest = max(LIMITS[task.split("/")[0]] for task in self.tasks)
-            object.__setattr__(self, "max_steps", longest)
+    @property
+    def time_limit(self) -> int:
+        return self.max_steps or max(LIMITS[task.split("/")[0]] for task in self.tasks)

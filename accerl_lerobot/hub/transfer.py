@@ -36,7 +36,7 @@ from huggingface_hub.errors import HfHubHTTPError, RepositoryNotFoundError, Revi
 from huggingface_hub.utils import filter_repo_objects
 
 from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.safety import FileSource, matching_files, unsafe_name
+from accerl_lerobot.checkpoint.safety import FileSource, leads_out, matching_files, unsafe_name
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.hub.card import (
     CARD,
@@ -70,8 +70,8 @@ STATUS = {
     429: "the Hub asks for fewer requests; wait a few minutes and run the same command again",
 }
 VOCABULARIES = ("tokenizer.json", "vocab.json", "added_tokens.json", "special_tokens_map.json")
-PATH = re.compile(r"(--[\w.]+=)?(~|/[^/\n]+)/[^\n]*")
-"""A path, alone or given to an argument: ``~`` or a folder at the top, and something below it."""
+ARGUMENT = re.compile(r"(--[\w.]+=)?(.*)", re.DOTALL)
+"""An argument with its value, or a text alone."""
 IGNORED = ["*.py", "*.pyc", "*.pyd", "*.so", ".git/*", ".gitattributes"]
 """Git's own files, and those that Python imports: a recipe beside one could name it as
 ``discover_packages_path``."""
@@ -177,10 +177,11 @@ def _without_paths(value: Any) -> Any:
         return [_without_paths(below) for below in value]
     if not isinstance(value, str):
         return value
-    match = PATH.fullmatch(value)
-    if match is None:
+    match = ARGUMENT.fullmatch(value)
+    assert match is not None
+    if not leads_out(match[2]):
         return value
-    return f"{match[1] or ''}{layout.AWAY}/{PurePosixPath(value).name}"
+    return f"{match[1] or ''}{layout.AWAY}/{PurePosixPath(match[2]).name}"
 
 
 def _as_json(tree: Any) -> bytes:

@@ -229,6 +229,7 @@ def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, 
 
 def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value: object) -> None:
     """Warns where many of a dataset's actions (N, A) lie outside the range that the environment executes."""
+    actions = actions.reshape(len(actions), -1)  # LeRobot stores one number a frame without a dimension
     slack = OUTSIDE_SLACK * (spec.action_high - spec.action_low)
     below = actions < spec.action_low - slack
     above = actions > spec.action_high + slack

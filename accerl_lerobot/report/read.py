@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, leaves, read_recipe
 from accerl_lerobot.console import ABSENT
@@ -85,7 +85,8 @@ def read_run(path: Path) -> Run:
     result = None
     if summary.is_file():
         result = read_json(summary, source)
-    written = max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html")
+    parts = (path / name for name in (CONFIG, METRICS, SUMMARY, CHECKPOINTS))  # what the run itself writes
+    written = max(part.stat().st_mtime for part in parts if part.exists())
     error = ""
     if log.is_file() and log.stat().st_mtime >= written:
         error = log.read_text(errors="replace").strip().rpartition("\n")[2]

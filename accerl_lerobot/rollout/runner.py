@@ -423,7 +423,7 @@ class RolloutRunner:
                 observation = environment.step_chunk(chunk).observation
             if not all(np.array_equal(observation[key], latest[key]) for key in latest):
                 why = "does not show again what it had shown, so its episodes cannot be resumed in the middle"
-                hint = "use launch.engine=ray, which begins them anew"
+                hint = "begin a new run from its last checkpoint, with --policy.path"
                 raise RuntimeError(f"{plan.task} with seed {plan.seed} {why}; {hint}")
 
     def close(self) -> None:

@@ -403,7 +403,9 @@ class Loop:
     def _draw(self, filmed: list[EpisodeResult], results: list[EpisodeResult]) -> None:
         """Write the run's pictures and its film."""
         success_curve(self.directory / "success_curve.png", self.state.evaluations, self.state.curve)
-        before_after(self.directory / "before_after.mp4", filmed, results, fps=20)
+        film = self.directory / "before_after.mp4"
+        film.unlink(missing_ok=True)  # it may be of an earlier end
+        before_after(film, filmed, results, fps=20)
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
 

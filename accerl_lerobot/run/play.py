@@ -8,6 +8,7 @@ model is trained on them and checked in ``pretraining``.
 from __future__ import annotations
 
 import contextlib
+import gc
 import itertools
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,6 +17,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
@@ -55,6 +57,9 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
             device = config.policy.device
             found = pretrain(model, config.env, dataset, folder, console, seed=config.seed, device=device)
         show(found, pretraining, console)
+    if torch.cuda.is_available():  # this process needs none of it any more
+        gc.collect()
+        torch.cuda.empty_cache()
     learn = replace(imagination.learn, dataset=dataset)
     path = str(pretraining / "world_model")
     return replace(config, imagination=replace(imagination, path=path, learn=learn))

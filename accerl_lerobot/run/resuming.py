@@ -105,6 +105,20 @@ def newest_checkpoint(directory: Path, resume_from: str, console: Console) -> Pa
     return path
 
 
+def check_engine(engine: str, checkpoint: Path) -> None:
+    """Refuse a checkpoint of the other engine."""
+    from accerl_lerobot.engines.local import LOCAL  # imports torch
+
+    former = "ray"
+    if (checkpoint / layout.TRAINING_STATE / f"{LOCAL}.json").is_file():
+        former = "local"
+    if engine != former:
+        was = "in one process" if former == "local" else "asynchronous"
+        raise InputError(
+            "launch.engine", engine, f"this run was {was}; resume it with launch.engine={former}"
+        )
+
+
 def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
     """The run as one that goes on from a checkpoint."""
     if config.policy.tuning.mode != "lora":

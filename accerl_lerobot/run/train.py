@@ -112,6 +112,25 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
             return run_plans(engine, count, "eval", console)
 
 
+def _with_absolute_paths(config: RunConfig) -> RunConfig:
+    """The config with absolute local paths: workers of a cluster have a working directory of their own."""
+
+    def absolute(section: Any) -> Any:
+        path = getattr(section, "path", None)
+        if path is None or not Path(path).expanduser().exists():
+            return section
+        return replace(section, path=str(Path(path).expanduser().absolute()))
+
+    rollout = replace(config.rollout, reward_model=absolute(config.rollout.reward_model))
+    return replace(
+        config,
+        policy=absolute(config.policy),
+        imagination=absolute(config.imagination),
+        world_model=absolute(config.world_model),
+        rollout=rollout,
+    )
+
+
 def make_engine(
     config: RunConfig,
     tasks: tuple[str, ...],
@@ -120,6 +139,7 @@ def make_engine(
     load: Load | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
+    config = _with_absolute_paths(config)
     numbers = history * config.env.state_size
     remembered = demonstrations_of(config)
     load = functools.partial(make_adapter, config.algorithm, config.state_model, numbers, remembered, load)
@@ -160,7 +180,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         return config
     if (warm := resuming.warm_started(directory)) is not None:
         return resuming.improving(config, warm)
-    for name in (f"{layout.DEMOS}.partial", "sft"):
+    for name in (f"{layout.DEMOS}.partial", "init", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
     if dataset.repo_id is None:
@@ -239,6 +259,7 @@ class Run:
             recipe = self.config
             checkpoint = resuming.checkpoint_of(self.directory, self.resume_from, self.console)
             if checkpoint is not None:
+                resuming.check_engine(recipe.launch.engine, checkpoint)
                 self.config = resuming.continued(recipe, self.directory, checkpoint)
             self.check()
             self.keep(recipe)  # only now: a resume that is refused leaves the run as it was

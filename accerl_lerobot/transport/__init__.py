@@ -49,6 +49,7 @@ ACCEPT_S = 10.0  # timeout of a service for each step of proving the key; other 
 RETRY_S = 1.0  # pause between two attempts to reach a service that was lost, and timeout of each
 SEND_S = 0.05  # how long `Client.send` waits for the service to read, before it leaves the rest to `done`
 OLDEST_S = 60.0  # largest age of a message that is believed; clocks of other nodes differ
+SILENT_S = 30  # after which a machine of which nothing is heard is lost
 IN_PIECES = 4096  # bytes from which on an array is not copied into the pickle
 BACKLOG = 1024  # clients that may wait to be accepted
 PIECES_AT_ONCE = 64  # pieces of memory per call of ``sendmsg``
@@ -96,6 +97,19 @@ def _proved(
         return socket.socket(fileno=os.dup(connection.fileno()))
 
 
+def _notice_a_lost_machine(end: socket.socket) -> None:
+    """Have a TCP connection fail within `SILENT_S` of the loss of the other machine, which says nothing."""
+    end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (
+        ("TCP_KEEPIDLE", SILENT_S // 2),
+        ("TCP_KEEPINTVL", SILENT_S // 6),
+        ("TCP_KEEPCNT", 3),
+        ("TCP_USER_TIMEOUT", 1000 * SILENT_S),
+    ):
+        if hasattr(socket, name):  # not on every system
+            end.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
 class Stream:
     """One end of a connection: whole messages, over a socket that is never waited for."""
 
@@ -104,6 +118,7 @@ class Stream:
         self.socket.setblocking(False)
         if self.socket.family != socket.AF_UNIX:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            _notice_a_lost_machine(self.socket)
         self.closed = False
         self.unsent: deque[memoryview] = deque()
         self._received: list[Any] = []

@@ -314,7 +314,9 @@ def load_episodes(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
             names = ["action"]
             if spec.state_dim:
                 names.append(STATE)
-            vectors = {name: numbers(data, name, dataset) for name in names}
+            columns = {name: numbers(data, name, dataset) for name in names}
+            # LeRobot stores one number a frame without a dimension.
+            vectors = {name: values.reshape(len(values), -1) for name, values in columns.items()}
             episodes = {}
             for labels in read_labels(data, dataset):
                 assert labels.success_at is not None  # `check_dataset` refuses a dataset without labels

@@ -121,7 +121,8 @@ class OnlineLearner:
         self._own.append(episode)
         self.learnt.add(episode.key)
         more = self.config.steps_per_episode
-        self.pending_steps = min(self.pending_steps + more, MOST_PENDING * more)
+        most = max(1.0, MOST_PENDING * more)
+        self.pending_steps = min(self.pending_steps + more, most)
 
     def step(self) -> dict[str, float]:
         """Makes one gradient step of both models."""
