@@ -152,8 +152,15 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_odd_text_stays_text() -> None:
-    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "*x"):
+    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "*x", "block #2", "012345", "1_000"):
         assert parse(RunConfig, [f"--job_name={text}"]).job_name == text
+
+
+def test_another_repository_is_not_asked_for_the_former_one_s_commit(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("policy: {path: me/one, revision: abc}\n")
+    assert parse(RunConfig, [str(path), "--policy.path=me/other"]).policy.revision is None
+    assert parse(RunConfig, [str(path), "--policy.path=me/one"]).policy.revision == "abc"
 
 
 ARENA = f"them/arena@{'0123456789' * 4}"

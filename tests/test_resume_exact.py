@@ -19,6 +19,7 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.run.resuming import check_engine
 from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.latent import LatentModel
 from benchmarks.simulated_environment import LatencyConfig
@@ -123,9 +124,13 @@ def test_a_run_left_before_it_began_learning(tiny_checkpoint: Path, tmp_path: Pa
     assert told(drive(first)) == told(drive(again))
 
 
-def test_the_state_of_an_asynchronous_run_is_refused(tiny_checkpoint: Path, tmp_path: Path):
+def test_a_checkpoint_of_the_other_engine_is_refused(tiny_checkpoint: Path, tmp_path: Path):
+    LocalEngine(tiny_run(tiny_checkpoint), ("match",)).save(tmp_path)
+    check_engine("local", tmp_path)
+    with pytest.raises(InputError, match=r"launch\.engine='ray': this run was in one process"):
+        check_engine("ray", tmp_path)
     with pytest.raises(InputError, match=r"launch\.engine='local': this run was asynchronous"):
-        LocalEngine(tiny_run(tiny_checkpoint), ("match",), state=tmp_path)
+        check_engine("local", tmp_path / "another")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

@@ -209,6 +209,7 @@ def _start(path: str, copy: Path) -> Path:
     start = fetched_checkpoint(path, None, "sft.init_path")
     if not displaced(start):
         return start
+    shutil.rmtree(copy, ignore_errors=True)  # of an SFT that was stopped
     shutil.copytree(start, copy)
     relocate(copy, copy)
     return copy

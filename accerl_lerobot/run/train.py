@@ -180,7 +180,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         return config
     if (warm := resuming.warm_started(directory)) is not None:
         return resuming.improving(config, warm)
-    for name in (f"{layout.DEMOS}.partial", "init", "sft"):
+    for name in (f"{layout.DEMOS}.partial", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
     if dataset.repo_id is None:

@@ -241,8 +241,10 @@ def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, mo
     run_sft(SFTConfig(steps=1, init_path=str(start)), HUB, tmp_path / "one" / "sft", seed=0)
     shutil.move(start, tmp_path / "moved")
     before = (tmp_path / "moved" / "config.json").read_text()
-    run_sft(SFTConfig(steps=1, init_path=str(tmp_path / "moved")), HUB, tmp_path / "two" / "sft", seed=0)
-    assert seen == [str(start), str(tmp_path / "two" / "init")]
+    moved = SFTConfig(steps=1, init_path=str(tmp_path / "moved"))
+    for _ in range(2):  # the second time after one that was stopped
+        run_sft(moved, HUB, tmp_path / "two" / "sft", seed=0)
+    assert seen == [str(start), *[str(tmp_path / "two" / "init")] * 2]
     assert (tmp_path / "moved" / "config.json").read_text() == before
     copied = (tmp_path / "two" / "init" / "config.json").read_text()
     relocate(tmp_path / "two" / "init", tmp_path / "two" / "init")

@@ -43,6 +43,8 @@ def test_the_command_for_stock_lerobot_has_the_limit_and_needs_its_key():
         *lerobot_eval_arguments(env, {})
     }
     assert lerobot_eval_arguments(env | {"success": "succeed"}, {}) == []
+    theirs = lerobot_eval_arguments(env | {"discover_packages_path": "my_envs"}, {})
+    assert "--env.discover_packages_path=my_envs" in theirs
 
 
 def test_stock_lerobot_is_told_the_name_of_its_lone_camera():

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accerl_lerobot.config.parsing import decode, encode
 from accerl_lerobot.envs import LiberoConfig, libero, make_environment
 from accerl_lerobot.envs.graphics import import_mujoco
 from accerl_lerobot.envs.libero import bddl_file, instruction, recorded_states
@@ -50,8 +51,10 @@ def test_names_and_texts_are_liberos_own():
     )
     assert len(LiberoConfig(task="libero_90").tasks) == 90
     limits = {"libero_object": 280, "libero_goal/3": 300, "libero_spatial,libero_10/0": 520}
-    assert {task: LiberoConfig(task=task).max_steps for task in limits} == limits
-    assert LiberoConfig(task="libero_10", max_steps=99).max_steps == 99
+    assert {task: LiberoConfig(task=task).time_limit for task in limits} == limits
+    assert LiberoConfig(task="libero_10", max_steps=99).time_limit == 99
+    written = encode(LiberoConfig(task="libero_object"))
+    assert decode(LiberoConfig, written | {"task": "libero_10"}).time_limit == 520, "not that of former tasks"
     assert instruction("libero_object/3") == "pick up the bbq sauce and place it in the basket"
     assert instruction("libero_10/2") == "turn on the stove and put the moka pot on it"
     assert bddl_file("libero_90/0").is_file()

@@ -170,7 +170,10 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
         "nested": [{"argument": f"--root={tmp_path.parent}/data/x.json,y"}],
         "home": "~/runs/one",
         "mac": "/Users/somebody/model",
-        "kept": ["lerobot/smolvla_base", "observation.front", 0.5, None, True, "m/s", "1/2/3", "/", "/tmp"],
+        "beside": "../runs/two",
+        "container": "/data",
+        "kept": ["lerobot/smolvla_base", "observation.front", 0.5, None, True, "m/s", "1/2/3", "/"],
+        "targets": r"layers\..\.q_proj",
         "url": "https://example.org/tmp/a/b",
         "pattern": "data/*/*.parquet",
     }
@@ -180,6 +183,8 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
         "nested": [{"argument": "--root=LOCAL/x.json,y"}],
         "home": "LOCAL/one",
         "mac": "LOCAL/model",
+        "beside": "LOCAL/two",
+        "container": "LOCAL/data",
     }
     dump = json.dumps if suffix == "json" else yaml.safe_dump
     data = without_paths(f"a.{suffix}", dump(tree).encode())

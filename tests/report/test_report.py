@@ -239,6 +239,8 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
     assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("img")) >= 9
     (folder / "error.log").write_text("Traceback …\nValueError: no film\n")
     assert "The run failed: ValueError: no film The traceback is in error.log." in page_of(folder).text
+    (folder / "timeline.json").write_text("{}")
+    assert "The run failed: ValueError: no film" in page_of(folder).text, "others write into the folder, too"
     (folder / "metrics.jsonl").unlink()
     assert page_of(folder).named("img") == [], "it has hardly begun"
 

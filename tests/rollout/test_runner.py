@@ -84,7 +84,7 @@ def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episo
     resumed.restore(state)
     assert environment.now == CHUNK and resumed.counters.decisions == 1
     environment.render = lambda height, width: np.full((height, width, 3), 99, np.uint8)
-    with pytest.raises(RuntimeError, match="does not show again .*use launch.engine=ray"):
+    with pytest.raises(RuntimeError, match="does not show again .*begin a new run from its"):
         resumed.restore(state)
 
 

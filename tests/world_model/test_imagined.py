@@ -188,6 +188,14 @@ def test_steps_are_pending_for_each_real_episode_up_to_a_limit():
     assert len(made._own) == 20 and made.pending_steps == 2 * online.MOST_PENDING
 
 
+def test_a_step_for_every_twentieth_episode_is_made(monkeypatch: pytest.MonkeyPatch):
+    made = learner()
+    monkeypatch.setattr(made, "config", replace(made.config, steps_per_episode=0.05))
+    for segment in episodes(*[False] * 21):
+        made.add(segment)
+    assert made.pending_steps >= 1
+
+
 def test_episodes_are_put_together_from_their_segments():
     made, parts = learner(), {seed: real_episode(seed, length=1) for seed in (1, 2)}
     assert [len(p) for p in parts.values()] == [4, 4]
