@@ -284,7 +284,7 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
         launch=LaunchConfig(stall_s=120),
         env=SimulatedConfig(max_steps=12, tolerance=0.4),
         rollout=RolloutConfig(workers=2, environments=2, segment_length=3),
-        trainer=TrainerConfig(updates=36, batch_decisions=16, lr=1e-3),
+        trainer=TrainerConfig(updates=120, batch_decisions=16, lr=1e-3),
         save_every_updates=3,
     )
     command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
@@ -310,9 +310,9 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
     ended = subprocess.run(again, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     train = [r for r in records(run) if r["kind"] == "train"]
-    assert [r["update"] for r in train] == list(range(1, 37)), "none lost, none twice"
+    assert [r["update"] for r in train] == list(range(1, 121)), "none lost, none twice"
     found = summary(run)
-    assert found["updates"] == 36 and found["n_before"] == found["n_after"] == 6
+    assert found["updates"] == 120 and found["n_before"] == found["n_after"] == 6
     evaluations = [r["group"] for r in records(run) if r["kind"] == "evaluation"]
     assert len(set(evaluations)) == len(evaluations) and {"before", "after"} <= set(evaluations)
     assert max(r["lag_max"] for r in train) == found["lag_max"] < 40
