@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
-import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.config.ranges import Range, Repeats, Section
@@ -103,7 +102,7 @@ def _parts(adapter: Any, config: BenchSamplersConfig) -> dict[str, Callable[[], 
             loss = adapter.imitate(observations, tasks, chunk)[0].mean()
         loss.backward()
         optimizer.step()
-        np.asarray(loss.detach().cpu())  # waits for a GPU
+        float(loss.detach())  # waits for a GPU
 
     return {
         "decide_one": lambda: adapter.decide(requests[:1], 0),

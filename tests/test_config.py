@@ -152,7 +152,7 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_odd_text_stays_text() -> None:
-    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "*x", "block #2", "012345", "1_000"):
+    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "*x", "block #2", "012345", "1_000", ""):
         assert parse(RunConfig, [f"--job_name={text}"]).job_name == text
 
 

@@ -148,9 +148,13 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             return metrics  # critic and teacher would learn on states that mean nothing yet
         return metrics | self._learn_to_act(new)
 
+    def transitions(self) -> np.ndarray:
+        """Rows of the memory that another one of their episode follows; the world model learns from these."""
+        return np.flatnonzero(~self.memory["last"])
+
     def _learn_states(self, new: int) -> Metrics:
         """Steps of the world model, where it learns; now and then the one that acts takes them over."""
-        transitions = np.flatnonzero(~self.memory["last"])
+        transitions = self.transitions()
         if self.state_learner is None or len(transitions) < LEAST_TRANSITIONS:
             return {}
         self._submit_steps(transitions, new)

@@ -60,6 +60,7 @@ NAMING = ("config.json", "*_config.json", "*processor.json", "accerl.json", "inf
 NOT_READ = "train_config.json"  # LeRobot's record of a training
 RECORDED = ("pretrained_path", "_name_or_path", "name_or_path", "special_tokens_map_file")
 """Keys that say where something once was. Nothing reads it there."""
+PATTERNS = ("targets",)  # keys of regular expressions, in which two dots are no folder
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
@@ -304,7 +305,7 @@ def check_names(folder: Path, origin: FileSource) -> None:
             if path.parent == folder and (folder / own).is_dir():
                 fields.pop(key, None)
         for key, text in texts_in(content):
-            if key not in RECORDED and leads_out(text):
+            if key not in (*RECORDED, *PATTERNS) and leads_out(text):
                 name = path.relative_to(folder).as_posix()
                 why = f"{text[:80]!r} is a place on this machine, which files from elsewhere may not name"
                 raise origin.refuse(f"{name}: {key}", f"{why}; a copy of a backbone goes into {BACKBONE}/")

@@ -89,7 +89,7 @@ def matching_files(root: Path, patterns: Iterable[str], origin: FileSource) -> d
 
 def leads_out(text: str) -> bool:
     """True for a text that, as the name of a file, is absolute or goes above its folder."""
-    return _ABSOLUTE.match(text) is not None or ".." in text.split("/")
+    return _ABSOLUTE.match(text) is not None or ".." in re.split(r"[\\/]", text)
 
 
 def texts_in(content: Any, key: str = "") -> Iterator[tuple[str, str]]:

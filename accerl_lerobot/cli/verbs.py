@@ -182,9 +182,9 @@ def evaluate(arguments: list[str]) -> int:
     with redirect_stdout(sys.stderr):
         results = run.play_evaluation(whole, console, config.evaluation.videos if out else 0)
     policy = config.policy.path
-    # `last` is another checkpoint after more updates.
-    if policy is not None and Path(policy).expanduser().exists():
-        policy = str(Path(policy).expanduser().resolve())
+    local = expanded(str(policy), "policy.path")
+    if local.exists():
+        policy = str(local.resolve())  # `last` is another checkpoint after more updates
     summary: dict[str, Any] = summarise(results) | {"policy": policy}
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))

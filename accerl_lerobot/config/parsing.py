@@ -311,7 +311,7 @@ def _value(text: str) -> Any:
         value = yaml.load(text, _Loader) if text else text
     except Exception:  # see `read_recipe`
         return text
-    unquoted = isinstance(value, str) and text[0] not in "'\""
+    unquoted = isinstance(value, str) and not text.startswith(("'", '"'))
     odd = isinstance(value, int) and not isinstance(value, bool) and str(value) != text
     if unquoted or odd:  # YAML would cut off what follows a #, and reads 012345 as an octal number
         return text

@@ -169,7 +169,9 @@ def without_paths(name: str, content: Path | bytes) -> Path | bytes:
 
 def _without_paths(value: Any) -> Any:
     if isinstance(value, dict):
-        tree = {key: _without_paths(below) for key, below in value.items()}
+        tree = dict(value)
+        for key in value.keys() - set(layout.PATTERNS):
+            tree[key] = _without_paths(value[key])
         if tree.get("output_dir") != value.get("output_dir"):
             tree["output_dir"] = None  # a repeated run gets a folder of its own
         return tree
@@ -181,7 +183,7 @@ def _without_paths(value: Any) -> Any:
     assert match is not None
     if not leads_out(match[2]):
         return value
-    return f"{match[1] or ''}{layout.AWAY}/{PurePosixPath(match[2]).name}"
+    return f"{match[1] or ''}{layout.AWAY}/{PurePosixPath(match[2]).name.removeprefix('..')}"
 
 
 def _as_json(tree: Any) -> bytes:

@@ -174,7 +174,7 @@ def _remember(
         hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     if isinstance(algorithm, ChunkCriticConfig) and update.state_learner is not None:
-        transitions = int(np.count_nonzero(~update.memory["last"]))
+        transitions = len(update.transitions())
         if transitions < LEAST_TRANSITIONS:
             why = f"{transitions} of its decisions are followed by another one in their episode"
             hint = f"{why}, and the world model learns from {LEAST_TRANSITIONS} or more"

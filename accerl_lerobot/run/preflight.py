@@ -284,7 +284,7 @@ def _check_padding(policy: Any, needs: Features, sft: SFTConfig) -> None:
     """Refuse a policy that pads to fewer numbers than there are: LeRobot would fail in the first step."""
     for field, name in (("max_state_dim", STATE), ("max_action_dim", ACTION)):
         most = getattr(policy, field, None)
-        (size,) = needs.shapes.get(name, (0,))
+        size = math.prod(needs.shapes.get(name, (0,)))
         if most is None or size <= most:
             continue
         hint = f"{name} has {size} numbers"

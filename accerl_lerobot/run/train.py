@@ -117,9 +117,12 @@ def _with_absolute_paths(config: RunConfig) -> RunConfig:
 
     def absolute(section: Any) -> Any:
         path = getattr(section, "path", None)
-        if path is None or not Path(path).expanduser().exists():
+        if path is None:
             return section
-        return replace(section, path=str(Path(path).expanduser().absolute()))
+        local = expanded(path, f"{section.SECTION}.path")
+        if not local.exists():  # a name on the Hub
+            return section
+        return replace(section, path=str(local.absolute()))
 
     rollout = replace(config.rollout, reward_model=absolute(config.rollout.reward_model))
     return replace(
@@ -140,6 +143,8 @@ def make_engine(
 ) -> Engine:
     """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
     config = _with_absolute_paths(config)
+    if state is not None:
+        state = state.absolute()
     numbers = history * config.env.state_size
     remembered = demonstrations_of(config)
     load = functools.partial(make_adapter, config.algorithm, config.state_model, numbers, remembered, load)

@@ -308,16 +308,10 @@ def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int
     decision."""
     field = "imagination.path"
     again = "train one of this environment"
-    for camera in environment.images:
-        if camera not in spec.cameras:
-            hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
-            raise InputError(field, camera, hint)
-    for camera in spec.cameras:
-        if camera not in environment.images:
-            hint = (
-                f"the world model needs this camera, the environment shows {[*environment.images]}; {again}"
-            )
-            raise InputError(field, camera, hint)
+    shown = tuple(environment.images)
+    for camera in sorted({*shown} ^ {*spec.cameras}):
+        hint = f"the environment shows {shown!r}, the world model {spec.cameras!r}; {again}"
+        raise InputError(field, camera, hint)
     for name in ("state_dim", "action_dim", "fps"):
         modelled = getattr(spec, name)
         real = getattr(environment, name)

@@ -172,6 +172,7 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
         "mac": "/Users/somebody/model",
         "beside": "../runs/two",
         "container": "/data",
+        "above": "..",
         "kept": ["lerobot/smolvla_base", "observation.front", 0.5, None, True, "m/s", "1/2/3", "/"],
         "targets": r"layers\..\.q_proj",
         "url": "https://example.org/tmp/a/b",
@@ -185,6 +186,7 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
         "mac": "LOCAL/model",
         "beside": "LOCAL/two",
         "container": "LOCAL/data",
+        "above": "LOCAL/",
     }
     dump = json.dumps if suffix == "json" else yaml.safe_dump
     data = without_paths(f"a.{suffix}", dump(tree).encode())
