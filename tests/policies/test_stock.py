@@ -114,8 +114,12 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
 
     path = written(kind)
     adapter = load_acting(config_of(path, kind))
-    stock = get_policy_class(kind).from_pretrained(path)
-    episodes = [steps_of(episode, 5) for episode in (1, 2)]
+    check_loop(adapter, get_policy_class(kind).from_pretrained(path), steps=5)
+
+
+def check_loop(adapter: Any, stock: Any, steps: int) -> None:
+    """Two episodes at the same time are those that LeRobot's loop plays one after the other."""
+    episodes = [steps_of(episode, steps) for episode in (1, 2)]
     found = [adapter.decide(list(asked), 3) for asked in zip(*episodes, strict=True)]
     for which, asked in enumerate(episodes):
         stock.reset()
@@ -142,18 +146,7 @@ def test_what_is_trained_on_later_images_acts_as_in_lerobot_s_loop(
         stock = get_policy_class(PreTrainedConfig.from_pretrained(path).type).from_pretrained(path)
         with pytest.raises(InputError, match="LeRobot trains it on what follows a chunk"):
             learning(path)
-    for episode in (1, 2):
-        stock.reset()
-        for request in steps_of(episode, 14):
-            torch.manual_seed(request.noise_seed)
-            batch = adapter.processing.prepare(*stack_observations([request]))
-            expected = adapter.processing.postprocessor(stock.select_action(batch)).numpy()
-            np.testing.assert_array_equal(adapter.decide([request], 0)[0].chunk, expected)
-    if write is write_lingbot_va:
-        ended, *_ = steps_of(3, 1)
-        adapter.decide([ended], 0)
-        with pytest.raises(InputError, match="it acts in one environment at a time; set rollout.workers=1"):
-            adapter.decide([steps_of(2, 15)[-1]], 0)
+    check_loop(adapter, stock, steps=14)
 
 
 def test_an_episode_that_is_run_again_begins_anew(written: Any):
@@ -475,24 +468,6 @@ def test_a_policy_that_learns_does_so_in_float32():
     assert config.vlm_dtype == "bfloat16"
     override(config, PolicyConfig(), learns=True)
     assert config.vlm_dtype == "float32"
-
-
-def test_a_policy_that_takes_no_batch_decides_one_by_one(
-    written: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
-
-    stock = VQBeTPolicy.select_action
-
-    def one_at_a_time(self: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        if len(batch["observation.state"]) > 1:
-            raise RuntimeError("one at a time, please")
-        return stock(self, batch)
-
-    monkeypatch.setattr(VQBeTPolicy, "select_action", one_at_a_time)
-    adapter = learning(written("vqbet"))
-    assert "vqbet policies decide for one environment at a time" in caplog.text
-    assert len(adapter.decide(adapter.example_requests(), 0)) == 2
 
 
 def test_a_policy_that_changes_while_it_acts_is_refused(written: Any, monkeypatch: pytest.MonkeyPatch):
