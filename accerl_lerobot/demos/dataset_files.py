@@ -246,7 +246,7 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
     origin = origin_of(dataset)
     texts = task_texts(data.meta)
     read = ("episode_index", "frame_index", "task_index", REWARD, SUCCESS)
-    columns = {name: numbers(data, name, dataset) for name in read if name in data.meta.features}
+    columns = {name: numbers(data, name, dataset).ravel() for name in read if name in data.meta.features}
     episode = columns["episode_index"]
     order = np.lexsort((columns["frame_index"], episode))
     ends = np.flatnonzero(np.diff(episode[order])) + 1
@@ -305,7 +305,7 @@ def step_of_reward(rewards: np.ndarray) -> int | None:
 
 
 def numbers(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:
-    """A column of finite numbers, one row per frame."""
+    """A column of finite numbers (frames, ...), each of the feature's shape."""
     rows = data.hf_dataset.with_format("numpy", columns=[name])[:]
     values = np.asarray(rows[name])
     origin = origin_of(dataset)
@@ -316,7 +316,8 @@ def numbers(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:
         row = data.hf_dataset[int(finite.argmin())]
         where = int(row["episode_index"])
         raise origin.refuse(name, f"a number that is not finite in episode {where}; leave the episode out")
-    return values
+    # LeRobot stores one number a frame without a dimension.
+    return values.reshape(-1, *data.meta.features[name]["shape"])
 
 
 def observations(

@@ -135,8 +135,7 @@ def recorded(
             if len(shape) > 2:
                 images.append(name)
             else:
-                column = numbers(data, name, dataset).astype(np.float32)
-                vectors[name] = column.reshape(-1, *shape)
+                vectors[name] = numbers(data, name, dataset).astype(np.float32)
         for episode in read_labels(data, dataset):
             success = episode.success or episode.success_at is None
             end = len(episode.rows)

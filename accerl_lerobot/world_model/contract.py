@@ -314,9 +314,7 @@ def load_episodes(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
             names = ["action"]
             if spec.state_dim:
                 names.append(STATE)
-            columns = {name: numbers(data, name, dataset) for name in names}
-            # LeRobot stores one number a frame without a dimension.
-            vectors = {name: values.reshape(len(values), -1) for name, values in columns.items()}
+            vectors = {name: numbers(data, name, dataset) for name in names}
             episodes = {}
             for labels in read_labels(data, dataset):
                 assert labels.success_at is not None  # `check_dataset` refuses a dataset without labels
