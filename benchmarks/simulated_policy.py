@@ -94,7 +94,7 @@ class SimulatedAdapter(PolicyAdapter):
     def copy_weights(self) -> dict[str, np.ndarray]:
         return self.export_trainable()
 
-    def save(self, directory: Path, config: PolicyConfig, weights: dict[str, np.ndarray]) -> None:
+    def save(self, directory: Path, weights: dict[str, np.ndarray]) -> None:
         snapshot.save(directory / "simulated", weights)
 
     def _value(self, rows: int) -> Tensor:

@@ -55,7 +55,7 @@ BACKBONE_FILES = (
 )  # fmt: skip
 """Files of a backbone's folder, without its weights."""
 BACKBONE_WEIGHTS = ("model*.safetensors", "model.safetensors.index.json")
-NAMING = ("config.json", "*_config.json", "*processor.json", "accerl.json", "info.json", "config.yaml")
+NAMING = ("config.json", "*_config.json", "*processor.json", "info.json", "config.yaml")
 """Files of a checkpoint, dataset or run whose texts may be taken for names of other files."""
 NOT_READ = "train_config.json"  # LeRobot's record of a training
 RECORDED = ("pretrained_path", "_name_or_path", "name_or_path", "special_tokens_map_file")

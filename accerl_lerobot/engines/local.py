@@ -129,7 +129,7 @@ class LocalEngine(Engine):
 
     def save(self, directory: Path) -> Saved:
         self._clock.enter(CHECKPOINT)
-        self._adapter.save(directory / PRETRAINED, self._config.policy, self._adapter.copy_weights())
+        self._adapter.save(directory / PRETRAINED, self._adapter.copy_weights())
         state = directory / TRAINING_STATE
         snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
         snapshot.save(state / "trainer", self._update.state())

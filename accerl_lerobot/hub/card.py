@@ -67,7 +67,7 @@ CONTENTS = {
         CONFIG, "train_config.json", "model*.safetensors", "model.safetensors.index.json",
         ADAPTER_CONFIG, ADAPTER,
         "policy_*processor.json", "*processor_step_*.safetensors",
-        "accerl.json", "value_head.safetensors", "family.safetensors",
+        "value_head.safetensors", "family.safetensors",
         *(f"{BACKBONE}/{name}" for name in OF_BACKBONE),
         *(f"{FAST}/{name}" for name in OF_BACKBONE),
         *(f"{FOLDER}/{name}" for name in KEPT[POLICY]),

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
+from accerl_lerobot.checkpoint.tensors import part_of, whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import (
     TASK,
@@ -31,12 +31,11 @@ from accerl_lerobot.experience import (
     stack_observations,
 )
 from accerl_lerobot.policies import saving
-from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, SamplerConfig
+from accerl_lerobot.policies.config import PLUGINS
 from accerl_lerobot.policies.family import Encoded, Family, Latent, Model, pooled
-from accerl_lerobot.policies.features import STATE
-from accerl_lerobot.policies.processing import IMAGES, Processing
+from accerl_lerobot.policies.features import ACTION, STATE, policy_features
+from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
-from accerl_lerobot.policies.untrusted import FAMILY, VALUE_HEAD
 
 HIDDEN = 128
 SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
@@ -112,11 +111,9 @@ class PolicyAdapter(nn.Module, ABC):
         """
         found: dict[str, nn.Module] = {}
         for name, module in self.named_modules():
-            if not name or not re.fullmatch(self.block_names, name):
-                continue
             inside = any(name.startswith(f"{outer}.") for outer in found)
-            has_weights = next(module.parameters(), None) is not None
-            if has_weights and not inside:
+            chosen = name and re.fullmatch(self.block_names, name)
+            if chosen and not inside and list(module.parameters()):
                 found[name] = module
         return list(found.values())
 
@@ -132,20 +129,15 @@ class PolicyAdapter(nn.Module, ABC):
         """A copy of what `save` writes, unaffected by further training."""
 
     @abstractmethod
-    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
+    def save(self, directory: Path, weights: Any) -> None:
         """Writes `weights`, from `copy_weights`, as ``pretrained_model`` into `directory`."""
 
     def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
         """Copies published weights in place."""
         with torch.no_grad():
             for name, parameter in self.trainable().items():
-                array = tensors[name]
-                on_cpu = parameter.device.type == "cpu"
-                # Received arrays are read-only, which torch cannot express: NumPy copies, where it can.
-                if on_cpu and parameter.dtype == torch.float32 and not in_parts(parameter):
-                    np.copyto(parameter.detach().numpy(), array)
-                else:
-                    parameter.copy_(part_of(torch.tensor(array), parameter))
+                # A copy: received arrays are read-only, which torch cannot express.
+                parameter.copy_(part_of(torch.tensor(tensors[name]), parameter))
 
     def view_trainable(self) -> dict[str, np.ndarray]:
         """`trainable` as NumPy arrays; on a CPU the parameters' own memory, to be copied before an update."""
@@ -166,10 +158,8 @@ class PretrainedAdapter(PolicyAdapter):
     With `precision` bf16 the network runs under autocast; densities are computed in fp32 either way.
     """
 
-    parts: dict[str, nn.Module]
-    """Modules with trainable parameters, by the names that these are published under."""
-    own_files: dict[str, nn.Module]
-    """Modules that LeRobot does not save, by the names of their files."""
+    own_parts: dict[str, nn.Module]
+    """Trained modules beside the policy, which LeRobot does not save, by name."""
     feature_width: int | None = None
     """Width of the features that `imitate` returns; None: they are not known."""
     explores = True
@@ -180,17 +170,11 @@ class PretrainedAdapter(PolicyAdapter):
         self.processing = processing
         self.precision = precision
         self.device = next(policy.parameters()).device
-        self.parts = {"policy": policy}
-        self.own_files = {}
+        self.own_parts = {}
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
         self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
         """Remembered by off-policy learning from the start; set by `run.adapter.make_adapter`."""
-
-    @property
-    @abstractmethod
-    def sampler(self) -> SamplerConfig:
-        """How it explores."""
 
     @abstractmethod
     def imitate(
@@ -213,7 +197,7 @@ class PretrainedAdapter(PolicyAdapter):
 
     def trainable(self) -> dict[str, Tensor]:
         named: dict[str, Tensor] = {}
-        for part, module in self.parts.items():
+        for part, module in ({"policy": self.policy} | self.own_parts).items():
             for name, parameter in module.named_parameters():
                 if parameter.requires_grad:
                     named[f"{part}.{name}"] = parameter
@@ -223,10 +207,12 @@ class PretrainedAdapter(PolicyAdapter):
         return named
 
     def copy_weights(self) -> saving.Weights:
-        return saving.copy_weights(self.policy, self.own_files)
+        return saving.copy_weights(self.policy, self.own_parts)
 
-    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
-        saving.save_pretrained(self, directory, config, weights)
+    def save(self, directory: Path, weights: saving.Weights | None = None) -> None:
+        """Writes LeRobot's ``pretrained_model`` layout; without `weights`, those of now."""
+        weights = weights or self.copy_weights()
+        saving.save_pretrained(self.policy, self.processing, directory, weights)
 
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length.
@@ -237,22 +223,21 @@ class PretrainedAdapter(PolicyAdapter):
         rng = np.random.default_rng(0)
         config = self.policy.config
         env_names = {policy: env for env, policy in self.processing.rename_map.items()}
-        batch = [2]
+        steps: tuple[int, ...] = ()
         if self.explores and config.n_obs_steps > 1:
-            batch.append(config.n_obs_steps)
-        arrays: Observations = {}
-        for key, feature in config.input_features.items():
-            name = env_names.get(key, key)
-            if key.startswith(IMAGES) and ".empty_camera_" not in key:
-                channels, height, width = feature.shape
-                arrays[name] = rng.integers(0, 256, (*batch, height, width, channels), dtype=np.uint8)
-            elif key == STATE:
-                arrays[name] = rng.standard_normal((*batch, *feature.shape), dtype=np.float32)
+            steps = (config.n_obs_steps,)
         requests: list[Request] = []
-        for i, task in enumerate(("Go", "Put the red cube on the plate")):
-            observation: Observation = {name: array[i] for name, array in arrays.items()}
-            observation[TASK] = task
-            requests.append(Request(observation=observation, noise_seed=i, explore=self.explores))
+        for seed, task in enumerate(("Go", "Put the red cube on the plate")):
+            observation: Observation = {TASK: task}
+            for key, shape in policy_features(config).shapes.items():
+                name = env_names.get(key, key)
+                if key == STATE:
+                    observation[name] = rng.standard_normal((*steps, *shape), dtype=np.float32)
+                elif key != ACTION:
+                    channels, height, width = shape
+                    size = (*steps, height, width, channels)
+                    observation[name] = rng.integers(0, 256, size, dtype=np.uint8)
+            requests.append(Request(observation=observation, noise_seed=seed, explore=self.explores))
         return requests
 
 
@@ -272,15 +257,9 @@ class LeRobotAdapter(PretrainedAdapter):
         self.model = model
         self.family = family.to(self.device)
         self.value_head = value_head.to(self.device)
-        self.parts |= {"family": self.family, "value_head": self.value_head}
-        self.own_files |= {VALUE_HEAD: self.value_head, FAMILY: self.family}
+        self.own_parts = {"family": self.family, "value_head": self.value_head}
         self.feature_width = model.width
-        if model.blocks:
-            self.block_names = rf"policy\.({model.blocks})"
-
-    @property
-    def sampler(self) -> SamplerConfig:
-        return self.family.sampler
+        self.block_names = rf"policy\.({model.blocks})"
 
     def encode(self, observations: Observations, tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
@@ -339,10 +318,7 @@ class LeRobotAdapter(PretrainedAdapter):
         if difference <= SELF_CHECK_TOLERANCE:
             return difference
         kind = self.policy.config.type
-        if kind in PLUGINS:
-            why = f"its adapter in {PLUGINS[kind]} acts unlike the policy without exploration"
-            hint = f"{why}, by {difference:.2e}; correct the adapter's encode or stock"
-            raise InputError("policy.type", kind, hint)
-        fits = f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}"
-        hint = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
-        raise InputError("lerobot", lerobot.__version__, hint)
+        package = PLUGINS.get(kind, f"LeRobot {lerobot.__version__}")
+        why = f"its adapter does not fit {package}: it differs from LeRobot's sampler by {difference:.2e}"
+        hint = "install the version that the adapter was written for, or correct its encode or stock"
+        raise InputError("policy.type", kind, f"{why}; {hint}")

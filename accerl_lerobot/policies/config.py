@@ -242,10 +242,8 @@ def check_observations(policy_config: Any, field: str) -> None:
 
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     """How a policy of this type explores in this run; refuses a sampler that does not suit it."""
-    families = [ANY]
-    if policy_type in POLICIES:
-        _, suitable = POLICIES[policy_type]
-        families = [*suitable, ANY]
+    _, suitable = POLICIES.get(policy_type, ("", ()))
+    families = [*suitable, ANY]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
@@ -308,22 +306,18 @@ def override(policy_config: Any, config: PolicyConfig, *, learns: bool = False) 
     if learns or policy_config.type in POLICIES:
         coarse = [name for name in DTYPES if getattr(policy_config, name, None) in COARSE]
         fixed |= dict.fromkeys(coarse, "float32")
-    for name, value in fixed.items():
-        if hasattr(policy_config, name):
-            setattr(policy_config, name, value)
     if config.num_steps is not None:
         names = [name for name in STEPS if hasattr(policy_config, name)]
         if not names:
             hint = f"LeRobot's config of a {policy_config.type} policy has no {' or '.join(STEPS)}"
             raise InputError("policy.num_steps", config.num_steps, f"{hint}; leave the field out")
-        for name in names:
-            setattr(policy_config, name, config.num_steps)
+        fixed |= dict.fromkeys(names, config.num_steps)
     if config.n_action_steps is not None:
-        rows = predicted_rows(policy_config)
-        if not rows or not hasattr(policy_config, "n_action_steps"):
-            hint = f"a {policy_config.type} policy has no such choice; leave the field out"
-            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
+        rows = predicted_rows(policy_config) if hasattr(policy_config, "n_action_steps") else 0
         if config.n_action_steps > rows:
-            hint = f"{policy_config.type}: at most {rows} rows of a predicted chunk can be executed"
-            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
-        policy_config.n_action_steps = config.n_action_steps
+            hint = f"{policy_config.type}: at most {rows} rows of a predicted chunk can be chosen"
+            raise InputError("policy.n_action_steps", config.n_action_steps, f"{hint}; leave the field out")
+        fixed["n_action_steps"] = config.n_action_steps
+    for name, value in fixed.items():
+        if hasattr(policy_config, name):
+            setattr(policy_config, name, value)

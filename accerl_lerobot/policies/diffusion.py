@@ -150,18 +150,15 @@ class Diffusion(Model):
 
         It draws from the global generator, which is put back.
         """
-        device = noise.device
-        eps = torch.zeros(len(self.schedule), *noise.shape, device=device)
         self.policy.reset()
-        gpus = [device] if device.type == "cuda" else []
+        gpus = [noise.device] if noise.device.type == "cuda" else []
         with torch.random.fork_rng(gpus):
             torch.manual_seed(0)
             chunk = self.stock(self._with_time(batch), noise=noise)
             torch.manual_seed(0)
-            for k, timestep in enumerate(self.schedule.timesteps):
-                if self.schedule.scheduler == "DDPM" and timestep > 0:
-                    eps[k] = torch.randn(noise.shape, device=device)
-        return chunk, eps.transpose(0, 1)
+            # A DDIM step draws none, nor does the last one; their std is 0.
+            eps = [torch.randn_like(noise) for _ in self.schedule.timesteps]
+        return chunk, torch.stack(eps, 1)
 
     def _with_time(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """As LeRobot's sampler wants it: state (B, O, S), images stacked (B, O, cameras, 3, H, W)."""

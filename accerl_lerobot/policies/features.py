@@ -18,15 +18,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STATE, ENV_STATE, ACTION = "observation.state", "observation.environment_state", "action"
-NUMERIC = ("float", "int", "uint", "bool")
-"""Beginnings of the types of a dataset's features that are numbers."""
-STATISTICS = {
-    "MEAN_STD": ("mean", "std"),
-    "MIN_MAX": ("min", "max"),
-    "QUANTILES": ("q01", "q99"),
-    "QUANTILE10": ("q10", "q90"),
-}
-"""LeRobot's modes of normalisation → the statistics that they read."""
 TEXT_FIELDS = ("tokenizer_", "text_encoder_", "text_tokenizer_", "vlm_", "qwen_")
 """Beginnings of the fields of LeRobot's policy configs that only policies with an instruction have."""
 OUTSIDE_SHARE, OUTSIDE_SLACK = 0.05, 0.01
@@ -86,20 +77,19 @@ def pads(policy: Any) -> bool:
     return hasattr(policy, "max_state_dim") and hasattr(policy, "empty_cameras")
 
 
-def fine_tuned_features(policy: Any, dataset: Features, renames: dict[str, str]) -> Features:
-    """Features that a policy needs once it is fine-tuned on a dataset; `renames` is dataset name → its name.
+def fine_tuned_features(policy: Any, dataset: Features) -> Features:
+    """Features that a policy needs once it is fine-tuned on a dataset.
 
-    One that pads takes the dataset's states and actions, and of its cameras those that are there; without
-    `renames` LeRobot wants one's cameras to be among the other's.
+    One that pads takes the dataset's states and actions, and of its cameras those that are there; LeRobot
+    wants one's cameras to be among the other's.
     """
     needed = policy_features(policy)
-    offered = {renames.get(name, name): shape for name, shape in dataset.shapes.items()}
     read = cameras(needed.shapes)
-    recorded = cameras(offered)
-    matching = bool(renames) or read <= recorded or recorded <= read
+    recorded = cameras(dataset.shapes)
+    matching = read <= recorded or recorded <= read
     if not (pads(policy) and read & recorded and matching):
         return needed
-    shapes = {name: offered[name] for name in needed.shapes if name in offered}
+    shapes = {name: dataset.shapes[name] for name in needed.shapes if name in dataset.shapes}
     return replace(needed, shapes=shapes)
 
 
@@ -115,14 +105,8 @@ def dataset_features(meta: Any) -> Features:
     if meta.camera_keys:
         shapes.pop(ENV_STATE, None)  # see `demos.guarded_train`
     for name in (STATE, ACTION):
-        if name in meta.features:
-            kind = meta.features[name]["dtype"]
-            if not kind.startswith(NUMERIC):
-                unusable[name] = f"it is {kind}, and policies read numbers; record it as float32"
-                del shapes[name]
-            continue
         parts = [key for key in meta.features if key.startswith(f"{name}.")]
-        if parts:
+        if parts and name not in shapes:
             hint = f"join them into one {name} with LeRobot's add_features"
             unusable[name] = f"it is in parts ({', '.join(parts)}); {hint}"
     tasks = tuple(map(str, meta.tasks.index))
@@ -161,30 +145,25 @@ def check_features(
     where an image is missing.
     """
     renames = "policy.rename_map"
-    sources = {name for name in offered.shapes if name != ACTION}
-    unknown = sorted(rename_map.keys() - sources)
-    if unknown:
-        names = ", ".join(sorted(sources))
-        raise InputError(renames, unknown[0], f"the {offerer} has no such feature; it offers {names}")
     shapes: Shapes = {}
     for name, shape in offered.shapes.items():
         new = rename_map.get(name, name)
         if new in shapes:
             raise InputError(renames, rename_map, f"two features of the {offerer} would be {new}")
         shapes[new] = shape
+    names = ", ".join(name for name in offered.shapes if name != ACTION) or "none"
+    for name in sorted(rename_map.keys() - offered.shapes.keys()):
+        raise InputError(renames, name, f"the {offerer} has no such feature; it offers {names}")
     for name, shape in needed.shapes.items():
         image = len(shape) == 3
         if name in offered.unusable:
             raise InputError(field, value, f"no {name} in the {offerer}: {offered.unusable[name]}")
         if name not in shapes:
-            same = [key for key, other in shapes.items() if len(other) == len(shape) and key != ACTION]
-            why = f"no {name} in the {offerer}, which offers {', '.join(same) or 'none'}"
+            why = f"no {name} in the {offerer}, which offers {names}"
             if image:
                 why += "; choose env.camera (env.images of gym), or map names with policy.rename_map" + hint
             raise InputError(field, value, why)
-        compared = len(shape)
-        if image and needed.any_size:
-            compared = 1  # the channels
+        compared = 1 if image and needed.any_size else None  # the channels
         if shapes[name][:compared] != shape[:compared]:
             advice = "give both one image size" if image else "choose parties that were made for each other"
             sizes = f"its {name} is {shape}, but {shapes[name]} in the {offerer}"
@@ -203,47 +182,33 @@ def check_features(
 
 def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, value: object) -> None:
     """Compares a dataset's instructions with an environment's."""
-    if not needed or not offered:
+    missing = [text for text in offered if text not in needed]
+    if not needed or not missing:
         return
-    if not any(needed):
-        why = f"its episodes have no instruction, and the environment's is {offered[0]!r}"
-        tool = f"lerobot-edit-dataset --operation.type=modify_tasks --operation.new_task={offered[0]!r}"
-        raise InputError(field, value, f"{why}; set it with {tool}, --repo_id and --root")
-    spelled = {_plain(text): text for text in needed}
-    missing = [text for text in offered if _plain(text) not in spelled]
     has = ", ".join(map(repr, needed[:4]))
-    if len(needed) > 4:
-        has += " …"
     lacks = ", ".join(map(repr, missing[:4]))
     message = f"no episode of {lacks}, the environment's task: it has {has}"
-    if len(missing) == len(offered):
-        raise InputError(field, value, f"{message}; choose env.task accordingly")
-    if missing:
-        logger.warning("%s=%r: %s", field, value, message)
-    for text in offered:
-        if text not in needed and text not in missing:
-            other = spelled[_plain(text)]
-            why = f"the environment's instruction is {text!r}, and the dataset's {other!r}"
-            logger.warning("%s=%r: %s; policies tell them apart", field, value, why)
+    known = {_plain(text) for text in needed}
+    if known.isdisjoint(map(_plain, offered)):
+        tool = "lerobot-edit-dataset --operation.type=modify_tasks"
+        raise InputError(field, value, f"{message}; choose env.task accordingly, or change them with {tool}")
+    logger.warning("%s=%r: %s; policies tell texts apart", field, value, message)
 
 
 def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value: object) -> None:
     """Warns where many of a dataset's actions (N, A) lie outside the range that the environment executes."""
-    actions = actions.reshape(len(actions), -1)  # LeRobot stores one number a frame without a dimension
     slack = OUTSIDE_SLACK * (spec.action_high - spec.action_low)
     below = actions < spec.action_low - slack
     above = actions > spec.action_high + slack
     share = (below | above).mean(0)
-    worst = int(share.argmax())
-    if share[worst] < OUTSIDE_SHARE:
+    i = int(share.argmax())
+    if share[i] < OUTSIDE_SHARE:
         return
-    column = actions[:, worst]
-    recorded = f"from {column.min():.4g} to {column.max():.4g} in the dataset"
-    bounds = f"{spec.action_low[worst]:.4g} to {spec.action_high[worst]:.4g} in the environment"
+    column = actions[:, i]
     logger.warning(
         "%s=%r: %.0f%% of its actions lie outside the environment's bounds, which cut them off: number %d is "
-        "%s, and %s; are both in the same unit?",
-        field, value, 100 * share[worst], worst, recorded, bounds,
+        "from %.4g to %.4g in the dataset, and %.4g to %.4g in the environment; are both in the same unit?",
+        field, value, 100 * share[i], i, column.min(), column.max(), spec.action_low[i], spec.action_high[i],
     )  # fmt: skip
 
 

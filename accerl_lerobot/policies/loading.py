@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 from lerobot.configs.policies import PreTrainedConfig
@@ -44,7 +45,6 @@ from accerl_lerobot.policies.processing import (
     Processing,
     check_statistics,
     correct_inputs,
-    keep_tokenizer_names,
     load_processors,
     use_own_files,
 )
@@ -77,12 +77,35 @@ class Sizes(NamedTuple):
     trained: int
 
 
-class Checkpoint(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
     """A LeRobot checkpoint whose files have been checked."""
 
     folder: Path
     source: FileSource
     config: Any  # LeRobot's config of the policy, with the run's choices in it
+    hub_names: dict[str, str]  # see `use_own_files`
+    run: PolicyConfig
+
+    @property
+    def model_class(self) -> type[Model] | None:
+        """The model of a policy type that has a likelihood; None for any other type."""
+        if self.config.type not in POLICIES:
+            return None
+        path, _ = POLICIES[self.config.type]
+        model_class: type[Model] = imported(path)
+        return model_class
+
+    @property
+    def precision(self) -> Precision:
+        """fp32 or bf16."""
+        return precision_on(torch.device(self.config.device), self.run.precision)
+
+    @contextlib.contextmanager
+    def acting(self) -> Iterator[None]:
+        """Holds while the policy acts for the first time, when some load tokenisers and encoders."""
+        with refusing(self.source, "it cannot act here"), guarded("policy", self.run.trust_remote_code):
+            yield
 
 
 _known_sizes: dict[tuple[str, bool, bool], Sizes] = {}  # of the dry runs of this process
@@ -90,17 +113,13 @@ _known_sizes: dict[tuple[str, bool, bool], Sizes] = {}  # of the dry runs of thi
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
-    available = torch.cuda.is_available()
     if name == "auto":
-        return torch.device("cuda" if available else "cpu")
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device(name)
-    if device.type != "cuda":
-        return device
-    if not available:
-        raise InputError(field, name, "no CUDA device here; use cpu or auto")
     count = torch.cuda.device_count()
-    if (device.index or 0) >= count:
-        raise InputError(field, name, f"there are {count} such devices here, numbered from 0")
+    if device.type == "cuda" and (device.index or 0) >= count:
+        here = f"there are {count} such devices here, numbered from 0" if count else "no CUDA device here"
+        raise InputError(field, name, f"{here}; use cpu or auto")
     return device
 
 
@@ -159,7 +178,11 @@ def load_acting(
     if checkpoint.config.type in POLICIES:
         with contextlib.suppress(NoDensityError):
             return load_adapter(config, dry_run=dry_run, fine_tuned=fine_tuned)
-    return _stock_adapter(checkpoint, config, None, dry_run, fine_tuned)
+    policy, processing = _load_parts(checkpoint, dry_run, fine_tuned)
+    adapter = StockAdapter(policy, processing, checkpoint.precision)
+    with checkpoint.acting():
+        adapter.try_out()
+    return adapter
 
 
 def load_adapter(
@@ -175,18 +198,19 @@ def load_adapter(
     """
     checkpoint = open_checkpoint(config, learns=True)
     sampler = sampler_config(config, checkpoint.config.type)
-    if isinstance(sampler, ChunkNoiseConfig):
-        return _stock_adapter(checkpoint, config, sampler, dry_run, fine_tuned)
-    model_class = _model_class(checkpoint)
-    assert model_class is not None
-    policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
-    # Some tokenisers are loaded when the policy acts for the first time.
-    with refusing(checkpoint.source, "it cannot act here"), guarded("policy", config.trust_remote_code):
+    model_class = checkpoint.model_class
+    policy, processing = _load_parts(checkpoint, dry_run, fine_tuned)
+    with checkpoint.acting():
+        if isinstance(sampler, ChunkNoiseConfig):
+            stock = StockAdapter(policy, processing, checkpoint.precision, sampler)
+            tune(policy, config.tuning, getattr(model_class, "backbone", None))
+            stock.self_check()
+            return stock
+        assert model_class is not None
         model = model_class(policy)
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
-        precision = precision_on(processing.device, config.precision)
-        adapter = LeRobotAdapter(policy, processing, model, family, critic, precision)
+        adapter = LeRobotAdapter(policy, processing, model, family, critic, checkpoint.precision)
         _load_ours(adapter, checkpoint)
         requests = adapter.example_requests()
         if not dry_run:
@@ -197,44 +221,9 @@ def load_adapter(
     return adapter
 
 
-def _stock_adapter(
-    checkpoint: Checkpoint,
-    config: PolicyConfig,
-    sampler: ChunkNoiseConfig | None,
-    dry_run: bool,
-    fine_tuned: bool,
-) -> StockAdapter:
-    """A policy of any type, which has acted once; with a `sampler` one that explores and learns."""
-    model_class = _model_class(checkpoint)
-    policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
-    precision = precision_on(processing.device, config.precision)
-    adapter = StockAdapter(policy, processing, precision, sampler)
-    # Some tokenisers and encoders are loaded when the policy acts for the first time.
-    with refusing(checkpoint.source, "it cannot act here"), guarded("policy", config.trust_remote_code):
-        if sampler is None:
-            adapter.try_out()
-        else:
-            backbone = None
-            if model_class is not None:
-                backbone = model_class.backbone
-            tune(policy, config.tuning, backbone)
-            adapter.self_check()
-    return adapter
-
-
-def _model_class(checkpoint: Checkpoint) -> type[Model] | None:
-    """The model of a policy type that has a likelihood; None for any other type."""
-    policy_type = checkpoint.config.type
-    if policy_type not in POLICIES:
-        return None
-    path, _ = POLICIES[policy_type]
-    model_class: type[Model] = imported(path)
-    return model_class
-
-
 def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
     """LeRobot's policy of any type, and its processors, for another use than to act."""
-    return _load_parts(open_checkpoint(config), config, None, False, False)
+    return _load_parts(open_checkpoint(config))
 
 
 def pinned(config: PolicyConfig) -> PolicyConfig:
@@ -271,26 +260,23 @@ def open_checkpoint(config: PolicyConfig, *, learns: bool = False) -> Checkpoint
     policy_config.device = str(resolve_device(config.device))
     override(policy_config, config, learns=learns)
     check_observations(policy_config, "policy.n_obs_steps")
-    use_own_files(policy_config, folder, source)
-    return Checkpoint(folder, source, policy_config)
+    hub_names = use_own_files(policy_config, folder, source)
+    return Checkpoint(folder=folder, source=source, config=policy_config, hub_names=hub_names, run=config)
 
 
 def _load_parts(
-    checkpoint: Checkpoint,
-    config: PolicyConfig,
-    model_class: type[Model] | None,
-    dry_run: bool,
-    fine_tuned: bool,
+    checkpoint: Checkpoint, dry_run: bool = False, fine_tuned: bool = False
 ) -> tuple[Any, Processing]:
     """LeRobot's policy with the checkpoint's weights, and its processors."""
-    folder, source, policy_config = checkpoint
-    check_statistics(policy_config, folder, source, replaced=fine_tuned)
+    folder, source, policy_config = checkpoint.folder, checkpoint.source, checkpoint.config
+    model_class = checkpoint.model_class
     with contextlib.ExitStack() as guards:
-        guards.enter_context(guarded("policy", config.trust_remote_code))
+        guards.enter_context(guarded("policy", checkpoint.run.trust_remote_code))
         if model_class is not None:
             guards.enter_context(model_class.loading())
         with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
-            processing = load_processors(policy_config, folder, config.rename_map)
+            processing = load_processors(policy_config, folder, checkpoint.run.rename_map)
+        check_statistics(processing, policy_config, source, replaced=fine_tuned)
         with refusing(source, "its network cannot be built as its config.json says"), Unfilled():
             policy = _build_network(policy_config, folder)
     unread: Sequence[str] = ()
@@ -304,9 +290,10 @@ def _load_parts(
     if base != folder:
         with refusing(source, "its adapter did not load"), guarded("policy"):
             policy = _merged(policy, folder, source)
-    keep_tokenizer_names(policy_config, folder)
+    for field, name in checkpoint.hub_names.items():
+        setattr(policy.config, field, name)
     policy.to(processing.device).eval()
-    if processing.device.type == "cuda" and precision_on(processing.device, config.precision) == "fp32":
+    if processing.device.type == "cuda" and checkpoint.precision == "fp32":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
         torch.backends.cudnn.allow_tf32 = False
@@ -320,14 +307,11 @@ def _build_network(policy_config: Any, folder: Path) -> Any:
     Types differ in the field that says so: ``load_vlm_weights``, or ``pretrained_path``, which LeRobot's
     command line sets to the checkpoint's `folder`.
     """
-    values = {"pretrained_path": folder, "load_vlm_weights": False}
-    former = {name: getattr(policy_config, name) for name in values if hasattr(policy_config, name)}
-    for name in former:
-        setattr(policy_config, name, values[name])
-    policy = get_policy_class(policy_config.type)(policy_config)
-    for name, value in former.items():
-        setattr(policy.config, name, value)
-    return policy
+    values: dict[str, Any] = {"pretrained_path": folder}
+    if hasattr(policy_config, "load_vlm_weights"):
+        values["load_vlm_weights"] = False
+    with patch.multiple(policy_config, **values):
+        return get_policy_class(policy_config.type)(policy_config)
 
 
 def load_weights(
@@ -353,12 +337,9 @@ def load_weights(
         "unexpected": list(stored.keys() - both),
         "of another shape": [name for name in both if stored[name].shape != expected[name].shape],
     }
-    if any(problems.values()):
-        counts: list[str] = []
-        for what, names in problems.items():
-            counts.append(f"{len(names)} {what} {sorted(names)[:3]}")
-        listed = ", ".join(counts)
-        hint = f"the weights did not load: tensors {listed}; config.json and {file.name} disagree"
+    found = [f"{len(names)} {what} {sorted(names)[:3]}" for what, names in problems.items() if names]
+    if found:
+        hint = f"the weights did not load: tensors {', '.join(found)}; config.json and {file.name} disagree"
         raise InputError(source.field, source.value, hint)
     if read:
         policy.load_state_dict(stored, strict=False)
@@ -408,10 +389,8 @@ def _merged(policy: Any, folder: Path, source: FileSource) -> Any:
     trainable = {name for name, parameter in policy.named_parameters() if parameter.requires_grad}
     stored = dict(read_tensors(folder / ADAPTER, source))
     wrapped = PeftModel.from_pretrained(policy, str(folder), torch_device="cpu")
-    differing = sorted(get_peft_model_state_dict(wrapped).keys() ^ stored.keys())
-    if differing:
-        why = f"{len(differing)} tensors are missing or unexpected, such as {differing[0]}"
-        raise source.refuse(ADAPTER, f"{why}; {ADAPTER_CONFIG} and this file disagree")
+    if get_peft_model_state_dict(wrapped).keys() != stored.keys():
+        raise source.refuse(ADAPTER, f"its tensors are not those of {ADAPTER_CONFIG} and the policy")
     policy = wrapped.merge_and_unload()
     for name, parameter in policy.named_parameters():
         parameter.requires_grad_(name in trainable)
@@ -420,9 +399,8 @@ def _merged(policy: Any, folder: Path, source: FileSource) -> Any:
 
 def _load_ours(adapter: LeRobotAdapter, checkpoint: Checkpoint) -> None:
     """Loads critic and family, where the checkpoint has them."""
-    folder, source, _ = checkpoint
-    for file, module in adapter.own_files.items():
-        if (folder / file).is_file():
-            with refusing(source, f"{file}: not of this policy; remove it to start anew"):
-                stored = dict(read_tensors(folder / file, source))
-                module.load_state_dict(stored)
+    for name, module in adapter.own_parts.items():
+        file = checkpoint.folder / f"{name}.safetensors"
+        if file.is_file():
+            with refusing(checkpoint.source, f"{file.name}: not of this policy; remove it to start anew"):
+                module.load_state_dict(dict(read_tensors(file, checkpoint.source)))

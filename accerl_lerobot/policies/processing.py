@@ -16,21 +16,30 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.layout import CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
-from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
+from accerl_lerobot.checkpoint.safety import FileSource, tensor_shapes
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observations
-from accerl_lerobot.policies.features import ACTION, STATE, STATISTICS, Shapes, cameras, pads, policy_features
-from accerl_lerobot.policies.untrusted import CONFIG, PROCESSORS
+from accerl_lerobot.policies.features import ACTION, STATE, Shapes, cameras, pads, policy_features
+from accerl_lerobot.policies.untrusted import CONFIG
 
 logger = logging.getLogger(__name__)
 
 IMAGES = "observation.image"  # begins ``observation.images.<camera>``; LeRobot's name for a lone camera
 CONSTANT = 1e-6  # environment units in one normalised unit, below which an action counts as constant
-NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
+ACTION_TOKENIZER = "action_tokenizer_processor"
+STATISTICS = {
+    NormalizationMode.MEAN_STD: ("mean", "std"),
+    NormalizationMode.MIN_MAX: ("min", "max"),
+    NormalizationMode.QUANTILES: ("q01", "q99"),
+    NormalizationMode.QUANTILE10: ("q10", "q90"),
+}
+"""LeRobot's modes of normalisation → the statistics that they read."""
 
 
 @dataclass
@@ -85,20 +94,16 @@ class Processing:
 def load_processors(policy_config: Any, folder: Path, rename_map: dict[str, str]) -> Processing:
     """The processors of a checkpoint that has been checked; `policy_config` is LeRobot's, with its device."""
     device = policy_config.device
+    steps = stored_steps(folder)
+    kinds = [step["registry_name"] for step in steps]
     overrides: dict[str, dict[str, Any]] = {"device_processor": {"device": device}}
-    steps = stored_steps(folder, PREPROCESSOR)
-    for step in steps:
-        kind = step["registry_name"]
-        options: dict[str, Any] = {}
-        if kind == "action_tokenizer_processor":  # LeRobot does not save these two of its options
-            options["paligemma_tokenizer_name"] = policy_config.text_tokenizer_name
-            options["fast_skip_tokens"] = policy_config.fast_skip_tokens
-        if kind in STEP_FOLDERS:
-            option, own = STEP_FOLDERS[kind]
-            if (folder / own).is_dir():
-                options[option] = str((folder / own).resolve())
-        if options:
-            overrides[kind] = options
+    for kind, (option, own) in STEP_FOLDERS.items():
+        if kind in kinds and (folder / own).is_dir():
+            overrides[kind] = {option: str((folder / own).resolve())}
+    if ACTION_TOKENIZER in kinds:  # LeRobot does not save these two of its options
+        options = overrides.setdefault(ACTION_TOKENIZER, {})
+        options["paligemma_tokenizer_name"] = policy_config.text_tokenizer_name
+        options["fast_skip_tokens"] = policy_config.fast_skip_tokens
     pre, post = make_pre_post_processors(
         policy_config, pretrained_path=str(folder), preprocessor_overrides=overrides
     )
@@ -120,30 +125,30 @@ def _statistics_width(postprocessor: Any) -> int:
     return width
 
 
-def use_own_files(policy_config: Any, folder: Path, source: FileSource) -> None:
-    """Points LeRobot's policy config at the backbone and tokenisers in a checkpoint's folder."""
+def use_own_files(policy_config: Any, folder: Path, source: FileSource) -> dict[str, str]:
+    """Points LeRobot's policy config at the backbone and tokenisers in a checkpoint's folder.
+
+    Returns:
+        The tokenisers' former names by their fields, which what is saved has again.
+    """
+    former: dict[str, str] = {}
     for field, own in CONFIG_FOLDERS.items():
         if not hasattr(policy_config, field):
             continue
+        if field != "vlm_model_name":
+            former[field] = getattr(policy_config, field)
         if (folder / own).is_dir():
             setattr(policy_config, field, str((folder / own).resolve()))
         named = Path(getattr(policy_config, field))
         if named.is_absolute() and not named.is_dir():
             hint = f"its files were in {named}, which is gone; put a copy into {own}/ beside {CONFIG}"
             raise InputError(source.field, source.value, hint)
+    return former
 
 
-def keep_tokenizer_names(policy_config: Any, folder: Path) -> None:
-    """Undoes `use_own_files` for tokenisers, in what will be saved, once they are loaded."""
-    stored = json.loads((folder / CONFIG).read_text())
-    for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
-        if field in stored and hasattr(policy_config, field):
-            setattr(policy_config, field, stored[field])
-
-
-def stored_steps(folder: Path, processor: str) -> list[dict[str, Any]]:
-    """Steps of a processor that has been checked; none if the file is missing."""
-    file = folder / processor
+def stored_steps(folder: Path) -> list[dict[str, Any]]:
+    """Steps of a preprocessor that has been checked; none if the file is missing."""
+    file = folder / PREPROCESSOR
     if not file.is_file():
         return []
     return json.loads(file.read_text())["steps"]
@@ -160,11 +165,11 @@ def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None
     seen: Shapes = {}
     renames: dict[str, str] = {}
     padded = False
-    for step in stored_steps(folder, PREPROCESSOR):
+    for step in stored_steps(folder):
         options = step.get("config", {})
         renames |= options.get("rename_map", {})
         padded |= "max_state_dim" in options
-        if step["registry_name"] in NORMALISERS and "state_file" in step:
+        if step["registry_name"] == "normalizer_processor" and "state_file" in step:
             shapes = tensor_shapes(folder / step["state_file"], source)
             for key, (_, shape) in shapes.items():
                 name = key.removesuffix(".mean")
@@ -180,41 +185,33 @@ def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None
         inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
 
 
-def check_statistics(policy_config: Any, folder: Path, source: FileSource, *, replaced: bool = False) -> None:
-    """Refuses a checkpoint whose processors lack numbers that they normalise by, or hold NaN.
+def check_statistics(
+    processing: Processing, policy_config: Any, source: FileSource, *, replaced: bool = False
+) -> None:
+    """Refuses processors that lack numbers that they normalise by, or hold NaN.
 
     None are needed if they are `replaced` by those of a training to come.
     """
     features = (policy_config.input_features or {}) | (policy_config.output_features or {})
-    for processor in PROCESSORS:
-        for step in stored_steps(folder, processor):
-            file = processor
-            state: dict[str, Tensor] = {}
-            if "state_file" in step:
-                file = step["state_file"]
-                state = dict(read_tensors(folder / file, source))
-            if step["registry_name"] not in NORMALISERS or replaced:
+    for step in (*processing.preprocessor.steps, *processing.postprocessor.steps):
+        state = step.state_dict()
+        for name, tensor in state.items():
+            if not torch.isfinite(tensor).all():
+                raise source.refuse(name, "its processors hold NaN or infinity; train it again")
+        if replaced or type(step) not in (NormalizerProcessorStep, UnnormalizerProcessorStep):
+            continue
+        chosen = {ACTION}
+        if isinstance(step, NormalizerProcessorStep):
+            chosen = set(step.normalize_observation_keys or step.features) - chosen
+        for name in sorted(chosen & features.keys()):
+            mode = step.norm_map.get(features[name].type)
+            needed = STATISTICS.get(mode, ())
+            complete = all(f"{name}.{statistic}" in state for statistic in needed)
+            if complete or ".empty_camera_" in name:
                 continue
-            options = step.get("config", {})
-            modes = options.get("norm_map", {})
-            for name in _normalised(step["registry_name"], options, features):
-                kind = features[name].type.value
-                needed = STATISTICS.get(modes.get(kind), ())
-                if all(f"{name}.{statistic}" in state for statistic in needed):
-                    continue
-                has = sorted({key.rpartition(".")[0] for key in state})
-                why = f"no {' and '.join(needed)} of {name}, by which the policy normalises"
-                why += f"; it has {', '.join(has[:6]) or 'none'}"
-                if kind != "VISUAL":
-                    hint = "fine-tuning it on a dataset (sft.init_path) computes new ones"
-                    raise source.refuse(file, f"{why}; {hint}")
-                logger.warning("%s; pictures go in as they are", source.refuse(file, why))
-
-
-def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) -> list[str]:
-    """Names of the features that a step changes when the policy acts."""
-    if step == "unnormalizer_processor":
-        return [ACTION] if ACTION in features else []
-    chosen = options.get("normalize_observation_keys") or options.get("features", {})
-    read = [name for name in features if name in chosen and name != ACTION]
-    return [name for name in read if ".empty_camera_" not in name]
+            has = ", ".join(sorted(step.stats)[:6]) or "none"
+            why = f"no {' and '.join(needed)} of it, by which the policy normalises; it has {has}"
+            if features[name].type != FeatureType.VISUAL:
+                hint = "fine-tuning it on a dataset (sft.init_path) computes new ones"
+                raise source.refuse(name, f"{why}; {hint}")
+            logger.warning("%s; pictures go in as they are", source.refuse(name, why))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoints in LeRobot's own format, with what is ours beside it, so that stock `lerobot-eval` runs them.
 
-Ours are ``accerl.json``, ``value_head.safetensors``, ``family.safetensors``, and the folder `layout.BACKBONE`
+Ours are ``value_head.safetensors``, ``family.safetensors``, and the folder `layout.BACKBONE`
 with a backbone's config and tokenisers, which LeRobot looks up by Hub id or absolute path. The folder goes
 first when one of our checkpoints is loaded: no Hub, and no gate such as PaliGemma's. Names in the files stay
 as they were where they are Hub ids, so that stock LeRobot loads the checkpoint as it loaded the original;
@@ -10,13 +10,11 @@ local paths are set to the folder by `layout.relocate`.
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import draccus
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -24,8 +22,8 @@ from accerl_lerobot.checkpoint.layout import BACKBONE, BACKBONE_FILES, BACKBONE_
 from accerl_lerobot.checkpoint.safety import FileSource, matching_files
 from accerl_lerobot.checkpoint.tensors import copy_of, place
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
-from accerl_lerobot.policies.untrusted import OURS
+from accerl_lerobot.policies.config import TuningConfig
+from accerl_lerobot.policies.processing import Processing
 
 
 def tune(policy: Any, config: TuningConfig, backbone: str | None = None, idle: tuple[str, ...] = ()) -> None:
@@ -65,9 +63,7 @@ def _inject(policy: Any, config: TuningConfig) -> None:
     linear = [name for name, module in policy.named_modules() if type(module) is nn.Linear]
     matching = [name for name in linear if re.fullmatch(targets, name)]
     if not matching:
-        step = max(1, len(linear) // 3)
-        some = ", ".join(linear[::step][:3])
-        hint = f"matches none of the policy's {len(linear)} linear layers, such as {some}"
+        hint = f"matches none of the policy's {len(linear)} linear layers, such as {', '.join(linear[-3:])}"
         raise InputError("policy.tuning.targets", targets, hint)
     policy.requires_grad_(False)
     lora = LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=matching, lora_dropout=0.0)
@@ -90,32 +86,26 @@ class Weights(NamedTuple):
     """All of an adapter's, on the CPU, under the names that LeRobot gives them."""
 
     policy: dict[str, Tensor]
-    ours: dict[str, dict[str, Tensor]]  # by the name of their file
+    own_parts: dict[str, dict[str, Tensor]]  # by the name of the module
 
 
-def copy_weights(policy: nn.Module, ours: dict[str, nn.Module]) -> Weights:
-    """A copy to be saved while the policy is trained on; `ours` are other modules, by file."""
-    states = {file: _copied(module.state_dict()) for file, module in ours.items()}
+def copy_weights(policy: nn.Module, own_parts: dict[str, nn.Module]) -> Weights:
+    """A copy to be saved while the policy is trained on; `own_parts` are the modules beside it."""
+    states = {name: _copied(module.state_dict()) for name, module in own_parts.items()}
     return Weights(_copied(merged_state_dict(policy)), states)
 
 
-def save_pretrained(
-    adapter: Any, directory: Path, config: PolicyConfig, weights: Weights | None = None
-) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it; without `weights`, those of now."""
-    weights = weights or adapter.copy_weights()
+def save_pretrained(policy: Any, processing: Processing, directory: Path, weights: Weights) -> None:
+    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it."""
     directory.mkdir(parents=True, exist_ok=True)
-    _save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
-    adapter.policy.save_pretrained(directory, state_dict=weights.policy)
-    adapter.processing.preprocessor.save_pretrained(directory)
-    adapter.processing.postprocessor.save_pretrained(directory)
+    _save_backbone(policy.config, processing.preprocessor, directory)
+    policy.save_pretrained(directory, state_dict=weights.policy)
+    processing.preprocessor.save_pretrained(directory)
+    processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
-    for file, tensors in weights.ours.items():
+    for name, tensors in weights.own_parts.items():
         if tensors:
-            save_file(tensors, directory / file)
-    ours = {"sampler": draccus.encode(adapter.sampler, SamplerConfig), "rename_map": config.rename_map}
-    text = json.dumps(ours, indent=2)
-    (directory / OURS).write_text(text + "\n")
+            save_file(tensors, directory / f"{name}.safetensors")
 
 
 def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> None:

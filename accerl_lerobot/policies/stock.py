@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
-from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
+from accerl_lerobot.policies.config import ChunkNoiseConfig, executed_rows
 from accerl_lerobot.policies.family import Latent
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.processing import CONSTANT, Processing
@@ -54,11 +54,6 @@ class StockAdapter(PretrainedAdapter):
         self._sampler = sampler
         self.explores = sampler is not None
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
-
-    @property
-    def sampler(self) -> SamplerConfig:
-        assert self._sampler is not None, "loaded to be evaluated only"
-        return self._sampler
 
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
@@ -162,13 +157,13 @@ class StockAdapter(PretrainedAdapter):
         """
         episode = episode_of(request.noise_seed), request.task
         begins = decision_of(request.noise_seed) == 0
-        if not begins and episode not in self._episodes:
-            why = "what it remembers of an episode is lost: its inference worker was replaced, or more than"
-            hint = f"{why} {EPISODES} environments share one; evaluate again, with more inference.workers"
-            raise InputError("policy.type", self.policy.config.type, hint)
         if begins:  # perhaps once more, after a rollout worker was lost
             self._episodes[episode] = copy_sharing_weights(self.policy)
             self._episodes[episode].reset()
+        elif episode not in self._episodes:
+            why = "what it remembers of an episode is lost: its inference worker was replaced, or more than"
+            hint = f"{why} {EPISODES} environments share one; evaluate again, with more inference.workers"
+            raise InputError("policy.type", self.policy.config.type, hint)
         self._episodes.move_to_end(episode)
         if len(self._episodes) > EPISODES:
             self._episodes.popitem(last=False)
@@ -196,18 +191,20 @@ class StockAdapter(PretrainedAdapter):
         """(B, K, A) by LeRobot's sampler, in normalised units; its noise follows from the first request."""
         arrays, tasks = stack_observations(requests)
         policy = self.policy
+        action_dim = policy.config.action_feature.shape[0]
         with torch.random.fork_rng(), self.autocast():
             torch.manual_seed(requests[0].noise_seed % 2**63)
             policy.reset()
             batches = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
             *earlier, newest = batches
-            with patch.object(policy, "predict_action_chunk", self._no_prediction):
+            # It only notes these observations, as nothing of this chunk is used.
+            unused = torch.zeros(len(requests), 1, action_dim, device=self.device)
+            with patch.object(policy, "predict_action_chunk", return_value=unused):
                 for batch in earlier:
                     policy.select_action(batch)
             # It computes a chunk at the first call, and takes one action after the other out of it.
             rows = [policy.select_action(dict(newest)) for _ in range(executed_rows(policy.config))]
             policy.reset()
-        action_dim = policy.config.action_feature.shape[0]
         return torch.stack(rows, 1)[..., :action_dim].float()  # without padding
 
     def _frames(self, arrays: Observations) -> list[Observations]:
@@ -219,12 +216,6 @@ class StockAdapter(PretrainedAdapter):
         for step in range(steps):
             frames.append({name: values[:, step] for name, values in arrays.items()})
         return frames
-
-    def _no_prediction(self, batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
-        """Zeros in the place of a predicted chunk, so that `select_action` only notes the observation."""
-        count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
-        action_dim = self.policy.config.action_feature.shape[0]
-        return torch.zeros(count, 1, action_dim, device=self.device)
 
     def _training_batch(
         self, observations: Observations, tasks: Sequence[str], chunk: Tensor
@@ -245,8 +236,7 @@ class StockAdapter(PretrainedAdapter):
             if steps is not None:
                 if config.n_obs_steps == 1:
                     batch[key] = tensor[:, None]
-                no_pad = torch.zeros(count, len(steps), dtype=torch.bool, device=self.device)
-                batch[f"{key}_is_pad"] = no_pad
+                batch[f"{key}_is_pad"] = tensor.new_zeros(count, len(steps), dtype=torch.bool)
         prepared: dict[str, Any] = self.processing.preprocessor(batch)
         return prepared
 

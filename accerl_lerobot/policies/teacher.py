@@ -129,15 +129,14 @@ class Teacher(nn.Module):
         if not rows:
             return chunk
         asked = [requests[i] for i in rows]
-        generators = [np.random.default_rng((request.noise_seed, 5)) for request in asked]
-        noise = np.stack([generator.standard_normal(self.chunk) for generator in generators])
         observations, tasks = stack_observations(asked)
         elapsed = np.array([request.elapsed for request in asked], np.float32)
-        own = self(self.states(observations, tasks, elapsed)).cpu()
-        noise = noise.astype(np.float32)
-        own = own + self.noise * torch.from_numpy(noise)
+        taught = self(self.states(observations, tasks, elapsed)).cpu()
         chunk = chunk.clone()
-        chunk[rows] = own.to(chunk)
+        for row, request, actions in zip(rows, asked, taught, strict=True):
+            generator = np.random.default_rng((request.noise_seed, 5))
+            noise = torch.from_numpy(generator.standard_normal(self.chunk))
+            chunk[row] = actions + self.noise * noise.to(actions)
         return chunk
 
 

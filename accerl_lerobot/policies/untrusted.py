@@ -28,8 +28,10 @@ from accerl_lerobot.errors import InputError, causes, expanded, in_one_line
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
-OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"
-FILES = ("*.json", WEIGHTS, ADAPTER, "*processor_step_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
+FILES = (
+    "*.json", WEIGHTS, ADAPTER, "*processor_step_*.safetensors", "value_head.safetensors",
+    "family.safetensors", f"{BACKBONE}/*",
+)  # fmt: skip
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
 LARGE = 2**16  # numbers of a tensor that is not filled, see `Unfilled`
@@ -104,10 +106,8 @@ def refusing(source: FileSource, what: str) -> Iterator[None]:
         yield
     except Exception as error:
         ours = input_error(error)
-        if ours is error:
-            raise
         if ours is not None:
-            raise ours from error
+            raise ours from None
         if isinstance(error, ImportError):
             what = "a package that it needs is missing"
         first: BaseException = error  # draccus wraps the error that tells why

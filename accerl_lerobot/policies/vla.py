@@ -28,7 +28,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -63,6 +62,12 @@ def _run(
         use_cache=True,
     )
     return hidden, cache
+
+
+def _read_prefix(network: Any, embedded: Tensor, pad: Tensor, mask: Tensor) -> tuple[Tensor, Any]:
+    """`_run` on the prefix, whose real tokens `pad` (B, P) marks."""
+    places = torch.cumsum(pad, dim=1) - 1
+    return _run(network, embedded, mask, places)
 
 
 def _velocity(model: Any, pad: Tensor, cache: Any, **shown: Tensor) -> Velocity:
@@ -107,9 +112,7 @@ class SmolVLA(FlowModel):
             batch[OBS_LANGUAGE_ATTENTION_MASK],
             state=self.policy.prepare_state(batch),
         )
-        mask = make_att_2d_masks(pad, att)
-        places = torch.cumsum(pad, dim=1) - 1
-        features, cache = _run(model.vlm_with_expert, embedded, mask, places)
+        features, cache = _read_prefix(model.vlm_with_expert, embedded, pad, make_att_2d_masks(pad, att))
         return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache))
 
 
@@ -150,8 +153,7 @@ class Pi05(FlowModel):
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         )
         mask = prepare_attention_masks_4d(make_att_2d_masks(pad, att))
-        places = torch.cumsum(pad, dim=1) - 1
-        features, cache = _run(model.paligemma_with_expert, embedded, mask, places)
+        features, cache = _read_prefix(model.paligemma_with_expert, embedded, pad, mask)
         shown = self._shown_to_expert(batch)
         # The critic reads the prefix: what is not in it stands beside every token, so their mean keeps it.
         for tensor in shown.values():
@@ -226,20 +228,14 @@ class FastTokenizer:
 
 @contextlib.contextmanager
 def data_only() -> Iterator[None]:
-    """While it lasts, LeRobot reads the tokenisers of π0-FAST and runs no code that comes with them."""
+    """While it lasts, LeRobot reads FAST's tokeniser of actions and runs no code that comes with it."""
     from lerobot.policies.pi0_fast import modeling_pi0_fast
     from lerobot.processor import tokenizer_processor
-    from transformers import AutoTokenizer
 
-    load = AutoTokenizer.from_pretrained
-
-    def load_data(name: str, **options: Any) -> Any:
-        options["trust_remote_code"] = False
-        return load(name, **options)
-
-    text = SimpleNamespace(from_pretrained=load_data)
-    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": text}
-    with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
+    with (
+        patch.object(modeling_pi0_fast, "AutoProcessor", FastTokenizer),
+        patch.object(tokenizer_processor, "AutoProcessor", FastTokenizer),
+    ):
         yield
 
 
@@ -280,8 +276,7 @@ class Pi0Fast(TokenModel):
         known = torch.cat([known, torch.ones_like(known[:, :1])], 1)
         embedded, pad, att, _, _ = model.embed_prefix_fast(images, image_masks, prompt, known)
         mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
-        places = torch.cumsum(pad, dim=1) - 1
-        features, cache = _run(network, embedded, mask, places)
+        features, cache = _read_prefix(network, embedded, pad, mask)
 
         def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
             """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""

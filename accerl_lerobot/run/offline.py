@@ -64,9 +64,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     _learn(config, update, directory, console)
 
     def write(folder: Path) -> int:
-        adapter = update.adapter
-        weights = adapter.copy_weights()
-        adapter.save(folder / layout.PRETRAINED, config.policy, weights)
+        update.adapter.save(folder / layout.PRETRAINED)
         shutil.copyfile(directory / layout.CONFIG, folder / layout.CONFIG)
         return int(update.version)
 

@@ -252,7 +252,7 @@ def check_training_data(
             hint = "; or name fewer in sft.policy.input_features"
             check_features(needs, offered, rename_map, *about, hint=hint)
     else:
-        needs = fine_tuned_features(policy, source, {})
+        needs = fine_tuned_features(policy, source)
         start = ("sft.init_path", sft.init_path)
         if data is not None:
             check_features(replace(needs, tasks=()), data, {}, *start, "dataset")

@@ -123,7 +123,7 @@ def check_saved(
     The adapter, which `config` loaded, must have weights other than its checkpoint's; `directory` is new.
     """
     decisions = [adapter.decide([request], 0)[0] for request in asked]
-    adapter.save(directory, config, adapter.copy_weights())
+    adapter.save(directory)
     loaded = load_adapter(replace(config, path=str(directory), revision=None))
     check_ratio_one(loaded, asked, decisions)
     check_alike(loaded.decide(asked, 0), decisions)

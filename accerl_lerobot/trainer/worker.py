@@ -99,7 +99,6 @@ class TrainerWorker:
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
-        self._policy = settings.policy
         self._config = settings.trainer
         self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
@@ -211,7 +210,7 @@ class TrainerWorker:
         weights, trained, state = self._kept
         self._kept = None
         fault_point("trainer.write")
-        self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
+        self._update.adapter.save(directory / PRETRAINED, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
-from accerl_lerobot.policies.config import PolicyConfig
 from tests.replay.segments import make_segment
 
 STATE = "observation.state"
@@ -67,7 +66,7 @@ class LinearAdapter(PolicyAdapter):
     def copy_weights(self) -> dict[str, Tensor]:
         return self.copy()
 
-    def save(self, directory: Path, config: PolicyConfig, weights: dict[str, Tensor]) -> None:
+    def save(self, directory: Path, weights: dict[str, Tensor]) -> None:
         snapshot.save(directory / "linear", weights)
 
 

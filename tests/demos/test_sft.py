@@ -22,7 +22,6 @@ from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.demos.sft import ANSWER, SFTConfig, picked, run_sft, sft_command
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
 from tests.tiny_datasets import record_dataset
@@ -227,10 +226,9 @@ def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set
 
 def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, monkeypatch):
     from accerl_lerobot.checkpoint.layout import relocate
-    from accerl_lerobot.policies.saving import save_pretrained
 
     start = tmp_path / "start"
-    save_pretrained(adapter_at(tiny_checkpoint), start, PolicyConfig(path=str(tiny_checkpoint)))
+    adapter_at(tiny_checkpoint).save(start)
     seen: list[str | None] = []
 
     def command(config: SFTConfig, *rest: object) -> list[str]:

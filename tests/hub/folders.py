@@ -49,7 +49,6 @@ def write_policy_folder(folder: Path, *, size: int = 3000, seed: int = 0, **conf
     rng = np.random.default_rng(seed)
     (folder / "model.safetensors").write_bytes(rng.bytes(size))
     (folder / "value_head.safetensors").write_bytes(rng.bytes(size // 2))
-    write_json(folder / "accerl.json", {"sampler": {}, "value_head": {}, "rename_map": {}})
     return folder
 
 

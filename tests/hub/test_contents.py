@@ -103,7 +103,7 @@ def test_an_adapter_brings_its_own_weights(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "name", ["config.json", "accerl.json", "backbone", "backbone/tokenizer.json", "README.md", "accerl_run"]
+    "name", ["config.json", "backbone", "backbone/tokenizer.json", "README.md", "accerl_run"]
 )
 def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
     secret = tmp_path / "secret"

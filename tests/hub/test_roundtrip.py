@@ -18,7 +18,6 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import save_checkpoint
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, pinned
-from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
@@ -75,7 +74,7 @@ def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
     perturb(adapter, 0.1)
 
     def write(directory: Path) -> int:
-        save_pretrained(adapter, directory / "pretrained_model", config)
+        adapter.save(directory / "pretrained_model")
         return 12
 
     save_checkpoint(tmp_path / "run" / "checkpoints", write)

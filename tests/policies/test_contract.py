@@ -18,7 +18,6 @@ from accerl_lerobot.experience import Observation, Request, stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
 from accerl_lerobot.policies.config import POLICIES, GaussianSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.processing import Processing
-from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_batches, check_gradient, check_saved, log_ratio, perturb, stored
 from tests.policies.cases import CASES, VARIANTS, Case
 from tests.policies.tiny import adapter_at, requests
@@ -201,8 +200,7 @@ def test_training_touches_neither_normalisation_nor_buffers_nor_what_is_frozen(
     evaluation = adapter.evaluate(*stack_observations(asked), latent)
     (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
     optimizer.step()
-    config = PolicyConfig(path=str(path), device="cpu", sampler=adapter.family.sampler)
-    save_pretrained(adapter, tmp_path / "trained", config)
+    adapter.save(tmp_path / "trained")
     files = [f.name for f in path.glob("policy_*processor*.safetensors")]
     assert len(files) >= 2 - (policy.case.kind == "pi0_fast")
     for file in files:
@@ -241,7 +239,7 @@ def test_stock_lerobot_runs_what_is_saved(policy: Policy, tmp_path: Path):
 
     adapter, saved, asked = policy.adapter, tmp_path / "saved", policy.asked[:3]
     perturb(adapter, 0.1)
-    save_pretrained(adapter, saved, PolicyConfig(path=str(policy.path), device="cpu"))
+    adapter.save(saved)
     with hub(tmp_path / "hub"), adapter.model.loading():
         stock = get_policy_class(policy.case.kind).from_pretrained(saved)
         pre, post = make_pre_post_processors(stock.config, pretrained_path=str(saved))

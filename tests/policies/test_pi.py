@@ -11,9 +11,8 @@ from torch import Tensor
 
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter
-from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, TokenSamplerConfig
+from accerl_lerobot.policies.config import FlowSamplerConfig, TokenSamplerConfig
 from accerl_lerobot.policies.flow import FlowFamily
-from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_ratio_one, perturb, stored
 from tests.policies.cases import CASES
 from tests.policies.tiny import adapter_at, requests
@@ -77,7 +76,7 @@ def test_a_bfloat16_checkpoint_acts_and_is_saved_in_float32(path: Path, tmp_path
     alone = [adapter.decide([request], 0)[0] for request in asked]
     check_ratio_one(adapter, asked, alone)
     perturb(adapter, 0.1)
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(origin), device="cpu"))
+    adapter.save(tmp_path / "saved")
     again = adapter_at(tmp_path / "saved")
     assert again.policy.config.dtype == "float32"
     expected = adapter.decide(asked, 0)

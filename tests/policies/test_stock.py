@@ -45,11 +45,9 @@ from tests.policies.tiny_vlms import (
     write_eo1,
     write_evo1,
     write_fastwam,
-    write_groot,
     write_lingbot_va,
     write_molmoact2,
     write_vla_jepa,
-    write_wall_x,
 )
 from tests.tiny_datasets import record_dataset
 
@@ -334,10 +332,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, bool], 
     return record
 
 
-NEEDED = {write_wall_x: ("torchdiffeq", "qwen_vl_utils"), write_groot: ("tree",)}
-"""Packages that some of LeRobot's policies need and that this package does not."""
-
-
 @pytest.mark.parametrize(
     ("write", "algorithm"),
     [
@@ -350,7 +344,6 @@ NEEDED = {write_wall_x: ("torchdiffeq", "qwen_vl_utils"), write_groot: ("tree",)
                 (write_diffusion, "chunk_critic"), (write_smolvla, "self_imitation"),
                 (write_pi0, "chunk_critic"), (write_pi05, "self_imitation"), (write_eo1, "chunk_critic"),
                 (write_evo1, "self_imitation"), (write_molmoact2, "self_imitation"),
-                (write_wall_x, "self_imitation"), (write_groot, "chunk_critic"),
             )
         ),
     ],
@@ -366,8 +359,6 @@ def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
-    for package in NEEDED.get(write, ()):
-        pytest.importorskip(package)
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 8)
     size = 64 if write in (write_vqbet, write_multi_task_dit, write_xvla) else 32

@@ -21,7 +21,6 @@ from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import edit_config, write_act, write_smolvla
@@ -35,7 +34,7 @@ ORIGIN = FileSource("policy.path", "theirs")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = write_act(tmp_path_factory.mktemp("files") / "made")
     config = PolicyConfig(path=str(made), device="cpu")
-    save_pretrained(load_adapter(config), made.parent / "saved", config)
+    load_adapter(config).save(made.parent / "saved")
     return made.parent / "saved"
 
 

@@ -10,11 +10,9 @@ import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from safetensors.torch import save_file
 
 from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import write_policy
@@ -61,11 +59,11 @@ def token_ids(tokenizer: Any) -> dict[str, Any]:
     return ids
 
 
-def write_qwen25_vl(folder: Path, *marks: str) -> tuple[dict[str, Any], Any]:
-    """The processor of a Qwen2.5-VL of one layer, with more `marks`; returns its config and the tokeniser."""
+def write_qwen25_vl(folder: Path) -> dict[str, Any]:
+    """The processor of a Qwen2.5-VL of one layer; returns its config."""
     from transformers import Qwen2_5_VLProcessor, Qwen2VLImageProcessor, Qwen2VLVideoProcessor
 
-    tokenizer = write_letters(folder, *(f"<|{mark}|>" for mark in MARKS), *marks)
+    tokenizer = write_letters(folder, *(f"<|{mark}|>" for mark in MARKS))
     config = token_ids(tokenizer)
     config["text_config"] = {
         "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_hidden_layers": 1, "num_attention_heads": 2,
@@ -75,7 +73,7 @@ def write_qwen25_vl(folder: Path, *marks: str) -> tuple[dict[str, Any], Any]:
     config["vision_config"] = VISION | {"window_size": 56, "fullatt_block_indexes": [0]}
     images = Qwen2VLImageProcessor(min_pixels=28 * 28, max_pixels=56 * 56)
     Qwen2_5_VLProcessor(images, tokenizer, Qwen2VLVideoProcessor(), TEMPLATE).save_pretrained(folder)
-    return config, tokenizer
+    return config
 
 
 def write_eo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
@@ -84,7 +82,7 @@ def write_eo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
     from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
     backbone = directory.parent / f"{directory.name}-qwen"
-    config, _ = write_qwen25_vl(backbone)
+    config = write_qwen25_vl(backbone)
     torch.manual_seed(0)
     Qwen2_5_VLForConditionalGeneration(Qwen2_5_VLConfig(**config)).save_pretrained(backbone)
     fields = {
@@ -198,31 +196,6 @@ def write_molmoact2(directory: Path, *, image: int = 64, **options: Any) -> Path
     return write_policy(directory, "molmoact2", image=image, **(fields | options))
 
 
-def write_wall_x(directory: Path, *, image: int = 64, **options: Any) -> Path:
-    """A Wall-X on a tiny Qwen2.5-VL with two experts."""
-    import torch
-    from lerobot.policies.wall_x.modeling_wall_x import Qwen2_5_VLMoEForAction
-    from lerobot.policies.wall_x.qwen_model.configuration_qwen2_5_vl import Qwen2_5_VLConfig
-
-    backbone = directory.parent / f"{directory.name}-qwen"
-    config, tokenizer = write_qwen25_vl(backbone, "<|action|>", "<|propri|>")
-    expert = {"hidden_size": WIDTH, "intermediate_size": WIDTH, "hidden_act": "silu"}
-    config["text_config"] |= {
-        "mlp_moe": True, "num_experts": 2, "experts": [expert, expert], "dim_inputs": [WIDTH, WIDTH],
-        "dof_config": {"joints": 4}, "vocab_size": len(tokenizer),
-    }  # fmt: skip
-    torch.manual_seed(0)
-    qwen = Qwen2_5_VLConfig(agent_pos_config={"joints": 4}, **config)
-    qwen.save_pretrained(backbone)
-    model = Qwen2_5_VLMoEForAction(qwen, processor=SimpleNamespace(tokenizer=tokenizer))
-    save_file(model.state_dict(), backbone / "model.safetensors")
-    fields = {
-        "pretrained_name_or_path": str(backbone), "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 4,
-        "max_action_dim": 4,
-    }  # fmt: skip
-    return write_policy(directory, "wall_x", image=image, **(fields | options))
-
-
 def write_qwen3_vl(folder: Path) -> dict[str, Any]:
     """The processor of a Qwen3-VL of one layer; returns its config."""
     from transformers import Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
@@ -238,37 +211,6 @@ def write_qwen3_vl(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
     config["vision_config"] = VISION | {"num_position_embeddings": 16, "deepstack_visual_indexes": [0]}
     return config
-
-
-def write_groot(directory: Path, *, image: int = 64, **options: Any) -> Path:
-    """A GR00T N1.7 on a tiny Qwen3-VL."""
-    import torch
-    from lerobot.policies.groot.groot_n1_7 import GR00TN17, GR00TN17Config
-    from transformers import Qwen3VLConfig
-
-    qwen, base = (directory.parent / f"{directory.name}-{part}" for part in ("qwen", "groot"))
-    Qwen3VLConfig(**write_qwen3_vl(qwen)).save_pretrained(qwen)
-    attention = {"num_attention_heads": 2, "attention_head_dim": 8, "dropout": 0.0, "final_dropout": False}
-    torch.manual_seed(0)
-    config = GR00TN17Config(
-        model_name=str(qwen), select_layer=1, backbone_embedding_dim=WIDTH, hidden_size=WIDTH,
-        input_embedding_dim=WIDTH, max_state_dim=8, max_action_dim=4, action_horizon=4, max_seq_len=16,
-        diffusion_model_cfg=attention | {
-            "num_layers": 2, "output_dim": WIDTH, "norm_type": "ada_norm", "interleave_self_attention": True,
-            "positional_embeddings": None,
-        },
-        vl_self_attention_cfg=attention | {"num_layers": 1, "positional_embeddings": None},
-        num_inference_timesteps=2,
-    )  # fmt: skip
-    GR00TN17(config, load_backbone_weights=False).save_pretrained(base)
-    fields = {
-        "base_model_path": str(base), "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 8,
-        "max_action_dim": 4,
-    }  # fmt: skip
-    path = write_policy(directory, "groot", image=image, **(fields | options))
-    processor = path / "policy_preprocessor.json"
-    processor.write_text(processor.read_text().replace("nvidia/Cosmos-Reason2-2B", str(qwen)))
-    return path
 
 
 def write_vla_jepa(directory: Path, *, image: int = 64, **options: Any) -> Path:
