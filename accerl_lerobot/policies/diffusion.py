@@ -21,7 +21,7 @@ Shapes: B batch, H horizon, A action dims, N steps, L factors: one per row.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,14 +30,13 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import DiffusionSamplerConfig
 from accerl_lerobot.policies.family import (
     Action,
     Encoded,
-    Family,
     Latent,
     Model,
+    NoiseFamily,
     normal_entropy,
     normal_log_prob,
 )
@@ -113,7 +112,7 @@ class Diffusion(Model):
         self.size = (config.horizon, config.action_feature.shape[0])
         first = config.n_obs_steps - 1  # rows before it stand for the past
         end = first + config.n_action_steps
-        self.rows = slice(first, min(end, config.horizon))
+        self.rows = slice(first, end)
         scheduler = policy.diffusion.noise_scheduler
         scheduler.set_timesteps(steps)
         timesteps = scheduler.timesteps.tolist()
@@ -145,20 +144,24 @@ class Diffusion(Model):
         mask = condition.new_ones(len(condition), 1).bool()
         return Encoded(features=condition[:, None], mask=mask, context=network)
 
-    def stock_and_noise(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
-        """LeRobot's own chunk from noise (B, H, A), and the step noise (B, N, H, A) that it drew.
+    def stock_and_noise(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """LeRobot's own chunk, the noise (B, H, A) that it began with and its step noise (B, N, H, A).
 
         It draws from the global generator, which is put back.
         """
+        inputs = self._with_time(batch)
+        state = inputs[OBS_STATE]
+        size = (len(state), *self.size)
         self.policy.reset()
-        gpus = [noise.device] if noise.device.type == "cuda" else []
+        gpus = [state.device] if state.device.type == "cuda" else []
         with torch.random.fork_rng(gpus):
             torch.manual_seed(0)
-            chunk = self.stock(self._with_time(batch), noise=noise)
+            chunk = self.stock(inputs)
             torch.manual_seed(0)
+            noise = torch.randn(size, device=state.device)
             # A DDIM step draws none, nor does the last one; their std is 0.
             eps = [torch.randn_like(noise) for _ in self.schedule.timesteps]
-        return chunk, torch.stack(eps, 1)
+        return chunk, noise, torch.stack(eps, 1)
 
     def _with_time(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """As LeRobot's sampler wants it: state (B, O, S), images stacked (B, O, cameras, 3, H, W)."""
@@ -170,7 +173,7 @@ class Diffusion(Model):
         return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}
 
 
-class DiffusionFamily(Family):
+class DiffusionFamily(NoiseFamily):
     """Diffusion policies explored by the noise of their steps. The latent is ``path``, (N + 1, H, A)."""
 
     counted: Tensor  # bool (N, H, 1), rows of each step's outcome that belong to the density
@@ -183,6 +186,7 @@ class DiffusionFamily(Family):
         self._factors = slice(None)
         """L rows. Those without a density are left out: as constant factors they would dilute means."""
         steps = len(self.schedule)
+        self.noise_sizes = (self.size, (steps, *self.size))
         if steps == 1:
             self._factors = self.rows
         horizon, action_dim = self.size
@@ -198,15 +202,11 @@ class DiffusionFamily(Family):
             entries = int(counted[k].sum()) * action_dim
             self.entropy += entries * float(normal_entropy(std))
 
-    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
-        device = encoded.features.device
-        steps = len(self.schedule)
-        x, eps = self.noise(requests, self.size, (steps, *self.size), device=device)
-        return self.sample(encoded.context, x, eps, self.exploring(requests, device))
-
     def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:
-        """Denoises `x` (B, H, A) with step noise `eps` (B, N, H, A); as LeRobot where not `explore` (B,)."""
+        """Denoises `x` (B, H, A) with step noise `eps` (B, N, H, A); as LeRobot where not `explore` (B,).
+
+        Without exploration a DDPM policy still draws step noise, as LeRobot's does.
+        """
         path = [x]
         log_prob = x.new_zeros(x.shape[:2])
         for k, timestep in enumerate(self.schedule.timesteps):
@@ -237,11 +237,8 @@ class DiffusionFamily(Family):
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        count = len(encoded.features)
-        generator = torch.Generator().manual_seed(0)
-        noise = torch.randn(count, *self.size, generator=generator).to(encoded.features.device)
-        stock, eps = self.model.stock_and_noise(batch, noise)
-        explore = torch.zeros(count, dtype=torch.bool, device=noise.device)
+        stock, noise, eps = self.model.stock_and_noise(batch)
+        explore = torch.zeros(len(noise), dtype=torch.bool, device=noise.device)
         ours = self.sample(encoded.context, noise, eps, explore)
         return float((ours.chunk - stock).abs().max())
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -127,6 +127,26 @@ class Family(nn.Module, ABC):
         return None
 
     @staticmethod
+    def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
+        """bool (B,)."""
+        return torch.tensor([request.explore for request in requests], device=device)
+
+
+class NoiseFamily(Family):
+    """A family that acts on standard normal noise, which is drawn from each request's own seed."""
+
+    noise_sizes: tuple[tuple[int, ...], ...]
+    """Sizes of the noise tensors of one request, in the order of the draws."""
+    sample: Callable[..., Action]
+    """Called with the context, a tensor of noise (B, *size) for each of these sizes, and bool (B,), True
+    where a request explores."""
+
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        device = encoded.features.device
+        noise = self.noise(requests, *self.noise_sizes, device=device)
+        return self.sample(encoded.context, *noise, self.exploring(requests, device))
+
+    @staticmethod
     def noise(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
         """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
         generators = [np.random.default_rng(request.noise_seed) for request in requests]
@@ -135,11 +155,6 @@ class Family(nn.Module, ABC):
             draws = np.stack([rng.standard_normal(size, dtype=np.float32) for rng in generators])
             tensors.append(torch.from_numpy(draws).to(device))
         return tensors
-
-    @staticmethod
-    def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
-        """bool (B,)."""
-        return torch.tensor([request.explore for request in requests], device=device)
 
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)

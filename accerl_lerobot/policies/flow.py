@@ -14,21 +14,20 @@ N steps, L log-prob factors, one per executed row.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.family import (
     Action,
     Encoded,
-    Family,
     Latent,
     Model,
+    NoiseFamily,
     normal_entropy,
     normal_log_prob,
 )
@@ -78,27 +77,23 @@ def flow_shape(config: Any, num_steps: int) -> FlowShape:
     )
 
 
-class FlowFamily(Family):
+class FlowFamily(NoiseFamily):
     """Flow policies explored by noise on the denoised chunk. The latent is ``path``, (2, K, D)."""
 
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__(model, sampler)
         self.shape = model.shape
+        size = (self.shape.chunk_size, self.shape.padded_dim)
+        # As many as steps are drawn, though one is used: recorded runs used these numbers.
+        self.noise_sizes = (size, (self.shape.num_steps, *size))
         entries = self.shape.executed * self.shape.action_dim
         self.entropy = entries * float(normal_entropy(torch.tensor(sampler.noise_level)))
         """Differential entropy of the executed entries; no weight changes it."""
 
-    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        device = encoded.features.device
-        size = (self.shape.chunk_size, self.shape.padded_dim)
-        # As many as steps are drawn, though one is used: recorded runs used these numbers.
-        x0, eps = self.noise(requests, size, (self.shape.num_steps, *size), device=device)
-        return self.sample(encoded.context, x0, eps[:, -1], self.exploring(requests, device))
-
     def sample(self, velocity: Velocity, x0: Tensor, eps: Tensor, explore: Tensor) -> Action:
-        """Denoises `x0` (B, K, D), and adds noise `eps` (B, K, D) where `explore` (B,), else as LeRobot."""
+        """Denoises `x0` (B, K, D); adds the last noise of `eps` (B, N, K, D) where `explore` (B,)."""
         mean = self.shape.integrate(velocity, x0)
-        noisy = mean + self._std(x0) * eps
+        noisy = mean + self._std(x0) * eps[:, -1]
         x = torch.where(explore[:, None, None], noisy, mean)
         log_prob = self._rows(x, mean)
         return Action(

@@ -13,22 +13,20 @@ Shapes: B batch, K rows of a chunk, A action dims, W width of a row's features; 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 
-from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import GaussianSamplerConfig
 from accerl_lerobot.policies.family import (
     Action,
     Encoded,
-    Family,
     Latent,
     Model,
     NoDensityError,
+    NoiseFamily,
     normal_entropy,
     normal_log_prob,
 )
@@ -70,35 +68,35 @@ class StdHead(nn.Module):
         return torch.exp(self.low + (self.high - self.low) * share)
 
 
-class GaussianFamily(Family):
+class GaussianFamily(NoiseFamily):
     """Policies explored by noise around the chunk they predict."""
 
     def __init__(self, model: GaussianModel, sampler: GaussianSamplerConfig) -> None:
         super().__init__(model, sampler)
         self.std = StdHead(model.row_width, model.action_dim, sampler)
+        self.noise_sizes = ((model.executed, model.action_dim),)
 
-    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        mean, std = self._gaussian(encoded)
-        (eps,) = self.noise(requests, tuple(mean.shape[1:]), device=mean.device)
-        explore = self.exploring(requests, mean.device)
+    def sample(self, context: Any, eps: Tensor, explore: Tensor) -> Action:
+        """The predicted chunk, with noise `eps` (B, L, A) where `explore` (B,)."""
+        mean, std = self._gaussian(context)
         u = torch.where(explore[:, None, None], mean + std * eps, mean)
         log_prob = normal_log_prob(u, mean, std).sum(-1)
         log_prob = torch.where(explore[:, None], log_prob, 0.0)
         return Action(u, {"u": u}, log_prob)
 
     def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
-        mean, std = self._gaussian(encoded)
+        mean, std = self._gaussian(encoded.context)
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
         return log_prob, normal_entropy(std).sum((1, 2))
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Mean absolute error, ACT's reconstruction loss."""
-        mean, _ = self._gaussian(encoded)
+        mean, _ = self._gaussian(encoded.context)
         return (mean - chunk).abs().mean((1, 2))
 
-    def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
+    def _gaussian(self, context: Any) -> tuple[Tensor, Tensor]:
         """Mean and std of the executed rows, each (B, L, A)."""
-        mean, rows = encoded.context
+        mean, rows = context
         executed = self.model.executed
         return mean[:, :executed], self.std(rows[:, :executed])
 

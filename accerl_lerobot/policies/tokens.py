@@ -43,9 +43,10 @@ class TokenContext:
     """tokens (B, L) → logits (B, L, V), differentiable; position l depends on ``tokens[:, :l]`` only, and in
     a parallel model on no token at all. With a terminator, any number of positions from the first on."""
     generate: Callable[[Choose], None] | None = None
-    """Autoregressive models, None in parallel ones. Calls `Choose` for positions 0, 1, … and feeds the model
-    with what it answers; ends after L positions, or once the answer is the terminator in every row (a row
-    that has ended goes on getting it). The logits are those of the call above, up to rounding."""
+    """None in a parallel model; an autoregressive one has a terminator. Calls `Choose` for positions 0, 1, …
+    and feeds the model with what it answers; ends after L positions, or once the answer is the terminator in
+    every row (a row that has ended goes on getting it). The logits are those of the call above, up to
+    rounding."""
 
 
 class TokenModel(Model):
@@ -57,10 +58,6 @@ class TokenModel(Model):
     @abstractmethod
     def chunk(self, tokens: Tensor) -> Tensor:
         """Tokens (B, L), terminators to the end after the first, to the executed (B, K, A), normalised."""
-
-    def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor | None:
-        """The tokens (B, L) behind `stock`, where many of them decode to one chunk."""
-        return None
 
 
 def draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
@@ -139,30 +136,6 @@ class TokenFamily(Family):
             return None
         return existing(latent["tokens"], terminator)
 
-    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """Compares greedy chunks and tokens, then the log-probs of the two passes.
-
-        An autoregressive model has two ways to its logits, and a policy may be trained in another layout than
-        it acts in. That changes log-probs by far more than rounding does, which is what is let pass here.
-        """
-        count = len(encoded.features)
-        device = encoded.features.device
-        explore = torch.zeros(count, dtype=torch.bool, device=device)
-        uniform = torch.zeros(count, self.model.length, device=device)
-        tokens, acted = self._decide(encoded, explore, uniform)
-        apart = self.model.chunk(tokens) - self.model.stock(batch)
-        difference = float(apart.abs().max())
-        factors = existing(tokens, self.model.terminator)
-        stock = self.model.stock_tokens(batch)
-        if stock is not None:
-            difference += float((tokens != stock)[factors].sum())
-        scored, _ = self.score(encoded, {"tokens": tokens})
-        gap = (scored - acted)[factors].abs().max()
-        rounding = torch.finfo(acted.dtype).eps ** 0.5
-        if not gap <= rounding:  # a NaN is not below: argmax finds a token among NaNs too
-            difference += float(gap)
-        return difference
-
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and their log-probs, each (B, L), in one pass or position by position."""
         context: TokenContext = encoded.context
@@ -177,17 +150,16 @@ class TokenFamily(Family):
         if context.generate is None:
             logits = context.logits(torch.zeros_like(uniform, dtype=torch.long))
             return pick(logits, uniform, explore[:, None])
-        fill = 0 if terminator is None else terminator
-        tokens = torch.full_like(uniform, fill, dtype=torch.long)
+        assert terminator is not None
+        tokens = torch.full_like(uniform, terminator, dtype=torch.long)
         log_prob = torch.zeros_like(uniform, dtype=torch.float32)
         running = torch.ones_like(explore)
 
         def choose(logits: Tensor, position: int) -> Tensor:
             picked, each = pick(logits, uniform[:, position], explore)
-            tokens[:, position] = torch.where(running, picked, fill)
+            tokens[:, position] = torch.where(running, picked, terminator)
             log_prob[:, position] = each
-            if terminator is not None:
-                running.logical_and_(picked != terminator)
+            running.logical_and_(picked != terminator)
             return tokens[:, position]
 
         context.generate(choose)

@@ -317,14 +317,6 @@ class Pi0Fast(TokenModel):
             tokens, action_horizon=config.n_action_steps, action_dim=action_dim
         )
 
-    def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
-        return self.policy.model.sample_actions_fast_kv_cache(
-            *self.policy._preprocess_images(batch),
-            batch[OBS_LANGUAGE_TOKENS],
-            batch[OBS_LANGUAGE_ATTENTION_MASK],
-            max_decoding_steps=self.length,
-        )
-
 
 def _decodable(record: logging.LogRecord) -> bool:
     """False for both lines that LeRobot logs of a sequence that it cannot decode: exploring draws many."""

@@ -7,19 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.console import Console
-from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
-from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request, stack_observations
-from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
-from accerl_lerobot.policies.family import Family
-from accerl_lerobot.run import train as run
+from accerl_lerobot.policies.family import NoiseFamily
 from tests.policies.checkpoints import write_diffusion
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
-from tests.runs import tiny_run
 
 
 def ask(count: int, **options: bool) -> list[Request]:
@@ -49,7 +42,7 @@ def test_not_exploring_is_lerobot_s_sampler_to_the_bit(
     observations, tasks = stack_observations(asked)
     assert adapter.self_check(observations, tasks) == 0.0
     sizes = (8, 2), (len(adapter.family.schedule), 8, 2)
-    noise, each = Family.noise(asked, *sizes, device=torch.device("cpu"))
+    noise, each = NoiseFamily.noise(asked, *sizes, device=torch.device("cpu"))
     steps = list(each.transpose(0, 1))
     for scheduler in ("ddpm", "ddim"):
         monkeypatch.setattr(
@@ -94,7 +87,7 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(looking: Path):
     while not ended:
         request = Request(observation=observation, noise_seed=decisions, explore=False)
         chunk = adapter.decide([request], 0)[0].chunk
-        noise = Family.noise([request], size, device=torch.device("cpu"))[0]
+        noise = NoiseFamily.noise([request], size, device=torch.device("cpu"))[0]
         for row in chunk:
             arrays = {k: np.asarray(v)[None] for k, v in policy_sees.items() if k != TASK}
             batch = adapter.processing.prepare(arrays, [str(policy_sees[TASK])])
@@ -114,21 +107,3 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(looking: Path):
             assert np.array_equal(observation[STATE][-1], result.observation[STATE])
         decisions += 1
     assert steps == 13 and decisions == 5
-
-
-def config_for(path: Path, output_dir: Path, **sections: object) -> RunConfig:
-    defaults = {
-        "env": WORLD,
-        "policy": PolicyConfig(path=str(path), device="cpu", sampler=DiffusionSamplerConfig(std_min=0.3)),
-        "trainer": TrainerConfig(updates=3, batch_decisions=16),
-        "launch": LaunchConfig(engine="local"),
-        "evaluation": EvaluationConfig(episodes=4, videos=0, before=False),
-        "output_dir": str(output_dir),
-    }
-    return tiny_run(path, **(defaults | sections))
-
-
-def test_a_run_asks_the_policy_how_far_it_looks_back(looking: Path, tmp_path: Path):
-    config = config_for(looking, tmp_path / "run")
-    summary = run.Run(config, run.make_output_dir(config), Console()).execute()
-    assert summary["updates"] == 3 and summary["n_after"] == 4 and summary["ratio_max_dev"] < 1

@@ -67,7 +67,7 @@ def flow(count: int = 150_000) -> Case:
     def act(pi: bool, seed: int) -> Action:
         draw = torch.Generator().manual_seed(seed)
         x0, eps = (torch.randn(count, 2, 3, generator=draw) for _ in range(2))
-        return family.sample(network(6, pi), x0, eps, torch.ones(count, dtype=torch.bool))
+        return family.sample(network(6, pi), x0, eps[:, None], torch.ones(count, dtype=torch.bool))
 
     entropy = torch.full((2,), family.entropy)
     return Case(act, lambda pi, latent: family.log_prob(network(6, pi), latent), entropy)
@@ -198,7 +198,7 @@ def slow_integrate(x0: np.ndarray, num_steps: int) -> np.ndarray:
 def test_the_flow_s_action_and_its_density_are_the_oracle_s(num_steps: int):
     flow, x0, eps = flow_of(num_steps)
     velocity = network(12, MU)
-    _, latent, log_prob = flow.sample(velocity, x0, eps, torch.ones(6, dtype=torch.bool))
+    _, latent, log_prob = flow.sample(velocity, x0, eps[:, None], torch.ones(6, dtype=torch.bool))
     x, mean = latent["path"][:, 1].numpy(), slow_integrate(x0.numpy(), num_steps)
     expected = np.zeros(6)
     for b in range(6):
@@ -219,7 +219,7 @@ def test_a_flow_that_does_not_explore_is_the_stock_sampler_bit_for_bit(num_steps
         stock = stock + dt * velocity(stock, torch.tensor(1.0 + step * dt).expand(6))
 
     def sample(*explore: bool) -> tuple[Tensor, Tensor]:
-        _, latent, log_prob = flow.sample(velocity, x0, eps, torch.tensor(explore))
+        _, latent, log_prob = flow.sample(velocity, x0, eps[:, None], torch.tensor(explore))
         return latent["path"][:, 1], log_prob
 
     x, log_prob = sample(*[False] * 6)

@@ -27,14 +27,13 @@ class Recurrent(TokenModel):
 
     terminator, length, width = END, LENGTH, WIDTH
 
-    def __init__(self, perturbation: float = 0.0, late: bool = False) -> None:
+    def __init__(self, perturbation: float = 0.0) -> None:
         draw = torch.Generator().manual_seed(1)
         self.embedding = torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.out = torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.decoder = torch.randn(LENGTH, VOCABULARY, 2, generator=draw)
         self.out += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.embedding += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
-        self.late = late
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         start = batch["observation"]
@@ -44,8 +43,7 @@ class Recurrent(TokenModel):
             h, rows = start, []
             for position in range(tokens.shape[1]):
                 rows.append(h @ self.out.T)
-                fed = tokens[:, max(0, position - self.late)]  # `late`: as if trained in another layout
-                h = torch.tanh(h + self.embedding[fed])
+                h = torch.tanh(h + self.embedding[tokens[:, position]])
             return torch.stack(rows, 1)
 
         def generate(choose: tk.Choose) -> None:
@@ -244,22 +242,9 @@ def test_a_large_vocabulary_is_drawn_from_without_rounding():
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_the_self_check_passes_what_agrees(kind: Any):
+def test_the_self_check_passes_the_most_likely_tokens_and_no_others(kind: Any):
     model, batch = kind(), {"observation": observations(6)}
-    assert family(model, 2.0).difference(batch, model.encode(batch)) == 0.0
-
-
-def test_the_self_check_catches_another_layout_a_changed_sampler_and_nan():
-    batch = {"observation": observations(6)}
-    late = Recurrent(late=True)
-    assert family(late).difference(batch, late.encode(batch)) > 0.01
-    for kind in MODELS:
-        model = kind()
-        read = model.encode(batch)
-        stock = model.stock(batch)
-        model.stock = lambda batch, stock=stock: stock + 0.1  # type: ignore[method-assign]
-        assert family(model).difference(batch, read) == pytest.approx(0.1, rel=1e-4)
-        broken = {"observation": torch.full((2, WIDTH), torch.nan)}
-        model = kind()
-        model.stock = lambda batch, model=model: model.chunk(torch.zeros(2, LENGTH, dtype=torch.int64))  # type: ignore[method-assign]
-        assert math.isnan(family(model).difference(broken, model.encode(broken)))
+    read, stock = model.encode(batch), model.stock(batch)
+    assert family(model, 2.0).difference(batch, read) == 0.0
+    model.stock = lambda batch: stock + 0.1
+    assert family(model).difference(batch, read) == pytest.approx(0.1, rel=1e-4)
