@@ -158,8 +158,8 @@ class PretrainedAdapter(PolicyAdapter):
     With `precision` bf16 the network runs under autocast; densities are computed in fp32 either way.
     """
 
-    own_parts: dict[str, nn.Module]
-    """Trained modules beside the policy, which LeRobot does not save, by name."""
+    parts: dict[str, nn.Module]
+    """Trained modules by name; LeRobot saves the one named ``policy``."""
     feature_width: int | None = None
     """Width of the features that `imitate` returns; None: they are not known."""
     explores = True
@@ -170,7 +170,7 @@ class PretrainedAdapter(PolicyAdapter):
         self.processing = processing
         self.precision = precision
         self.device = next(policy.parameters()).device
-        self.own_parts = {}
+        self.parts = {"policy": policy}
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
         self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
@@ -197,7 +197,7 @@ class PretrainedAdapter(PolicyAdapter):
 
     def trainable(self) -> dict[str, Tensor]:
         named: dict[str, Tensor] = {}
-        for part, module in ({"policy": self.policy} | self.own_parts).items():
+        for part, module in self.parts.items():
             for name, parameter in module.named_parameters():
                 if parameter.requires_grad:
                     named[f"{part}.{name}"] = parameter
@@ -207,7 +207,7 @@ class PretrainedAdapter(PolicyAdapter):
         return named
 
     def copy_weights(self) -> saving.Weights:
-        return saving.copy_weights(self.policy, self.own_parts)
+        return {name: saving.copy_state(module) for name, module in self.parts.items()}
 
     def save(self, directory: Path, weights: saving.Weights | None = None) -> None:
         """Writes LeRobot's ``pretrained_model`` layout; without `weights`, those of now."""
@@ -257,7 +257,7 @@ class LeRobotAdapter(PretrainedAdapter):
         self.model = model
         self.family = family.to(self.device)
         self.value_head = value_head.to(self.device)
-        self.own_parts = {"family": self.family, "value_head": self.value_head}
+        self.parts |= {"family": self.family, "value_head": self.value_head}
         self.feature_width = model.width
         self.block_names = rf"policy\.({model.blocks})"
 

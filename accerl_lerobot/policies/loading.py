@@ -88,10 +88,10 @@ class Checkpoint:
     run: PolicyConfig
 
     @property
-    def model_class(self) -> type[Model] | None:
-        """The model of a policy type that has a likelihood; None for any other type."""
+    def model_class(self) -> type[Model]:
+        """The model of a policy type that has a likelihood; `Model` itself for any other type."""
         if self.config.type not in POLICIES:
-            return None
+            return Model
         path, _ = POLICIES[self.config.type]
         model_class: type[Model] = imported(path)
         return model_class
@@ -198,16 +198,14 @@ def load_adapter(
     """
     checkpoint = open_checkpoint(config, learns=True)
     sampler = sampler_config(config, checkpoint.config.type)
-    model_class = checkpoint.model_class
     policy, processing = _load_parts(checkpoint, dry_run, fine_tuned)
     with checkpoint.acting():
         if isinstance(sampler, ChunkNoiseConfig):
             stock = StockAdapter(policy, processing, checkpoint.precision, sampler)
-            tune(policy, config.tuning, getattr(model_class, "backbone", None))
+            tune(policy, config.tuning, checkpoint.model_class.backbone)
             stock.self_check()
             return stock
-        assert model_class is not None
-        model = model_class(policy)
+        model = checkpoint.model_class(policy)
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, checkpoint.precision)
@@ -270,23 +268,18 @@ def _load_parts(
     """LeRobot's policy with the checkpoint's weights, and its processors."""
     folder, source, policy_config = checkpoint.folder, checkpoint.source, checkpoint.config
     model_class = checkpoint.model_class
-    with contextlib.ExitStack() as guards:
-        guards.enter_context(guarded("policy", checkpoint.run.trust_remote_code))
-        if model_class is not None:
-            guards.enter_context(model_class.loading())
+    with guarded("policy", checkpoint.run.trust_remote_code), model_class.loading():
         with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
             processing = load_processors(policy_config, folder, checkpoint.run.rename_map)
         check_statistics(processing, policy_config, source, replaced=fine_tuned)
         with refusing(source, "its network cannot be built as its config.json says"), Unfilled():
             policy = _build_network(policy_config, folder)
-    unread: Sequence[str] = ()
-    if model_class is not None:
-        unread = model_class.unread
+    if policy_config.type in POLICIES:
         # LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
         # gradient are lost.
         policy = policy.float()
     base = weights_folder(folder, source)
-    load_weights(policy, unread, base / WEIGHTS, source, read=not dry_run)
+    load_weights(policy, model_class.unread, base / WEIGHTS, source, read=not dry_run)
     if base != folder:
         with refusing(source, "its adapter did not load"), guarded("policy"):
             policy = _merged(policy, folder, source)
@@ -399,8 +392,8 @@ def _merged(policy: Any, folder: Path, source: FileSource) -> Any:
 
 def _load_ours(adapter: LeRobotAdapter, checkpoint: Checkpoint) -> None:
     """Loads critic and family, where the checkpoint has them."""
-    for name, module in adapter.own_parts.items():
+    for name, module in adapter.parts.items():
         file = checkpoint.folder / f"{name}.safetensors"
-        if file.is_file():
+        if name != "policy" and file.is_file():
             with refusing(checkpoint.source, f"{file.name}: not of this policy; remove it to start anew"):
                 module.load_state_dict(dict(read_tensors(file, checkpoint.source)))

@@ -133,15 +133,15 @@ def use_own_files(policy_config: Any, folder: Path, source: FileSource) -> dict[
     """
     former: dict[str, str] = {}
     for field, own in CONFIG_FOLDERS.items():
-        if not hasattr(policy_config, field):
+        name = getattr(policy_config, field, None)
+        if name is None:
             continue
         if field != "vlm_model_name":
-            former[field] = getattr(policy_config, field)
+            former[field] = name
         if (folder / own).is_dir():
             setattr(policy_config, field, str((folder / own).resolve()))
-        named = Path(getattr(policy_config, field))
-        if named.is_absolute() and not named.is_dir():
-            hint = f"its files were in {named}, which is gone; put a copy into {own}/ beside {CONFIG}"
+        elif Path(name).is_absolute() and not Path(name).is_dir():
+            hint = f"its files were in {name}, which is gone; put a copy into {own}/ beside {CONFIG}"
             raise InputError(source.field, source.value, hint)
     return former
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -82,29 +82,35 @@ def merged_state_dict(policy: nn.Module) -> dict[str, Tensor]:
     return {name.replace(".base_layer.", "."): tensor.detach() for name, tensor in state.items()}
 
 
-class Weights(NamedTuple):
-    """All of an adapter's, on the CPU, under the names that LeRobot gives them."""
-
-    policy: dict[str, Tensor]
-    own_parts: dict[str, dict[str, Tensor]]  # by the name of the module
+Weights = dict[str, dict[str, Tensor]]
+"""All of an adapter's by part and by the names that LeRobot gives them, on the CPU."""
 
 
-def copy_weights(policy: nn.Module, own_parts: dict[str, nn.Module]) -> Weights:
-    """A copy to be saved while the policy is trained on; `own_parts` are the modules beside it."""
-    states = {name: _copied(module.state_dict()) for name, module in own_parts.items()}
-    return Weights(_copied(merged_state_dict(policy)), states)
+def copy_state(module: nn.Module) -> dict[str, Tensor]:
+    """A copy of `merged_state_dict` on the CPU, to be saved while the module is trained on.
+
+    What shared its memory shares it again, so that it is written once.
+    """
+    copies: dict[tuple[object, ...], Tensor] = {}  # by the place of the tensor that is copied
+    named: dict[str, Tensor] = {}
+    for name, tensor in merged_state_dict(module).items():
+        at = place(tensor)
+        if at not in copies:
+            copies[at] = copy_of(tensor).contiguous()
+        named[name] = copies[at]
+    return named
 
 
 def save_pretrained(policy: Any, processing: Processing, directory: Path, weights: Weights) -> None:
     """Writes LeRobot's ``pretrained_model`` layout, and ours beside it."""
     directory.mkdir(parents=True, exist_ok=True)
     _save_backbone(policy.config, processing.preprocessor, directory)
-    policy.save_pretrained(directory, state_dict=weights.policy)
+    policy.save_pretrained(directory, state_dict=weights["policy"])
     processing.preprocessor.save_pretrained(directory)
     processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
-    for name, tensors in weights.own_parts.items():
-        if tensors:
+    for name, tensors in weights.items():
+        if tensors and name != "policy":
             save_file(tensors, directory / f"{name}.safetensors")
 
 
@@ -128,15 +134,3 @@ def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> N
         files = matching_files(source, wanted, FileSource("policy.path", str(source)))
         for name, file in files.items():
             shutil.copyfile(file, target / name)
-
-
-def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
-    copies: dict[tuple[object, ...], Tensor] = {}  # by the place of the tensor that is copied
-    named: dict[str, Tensor] = {}
-    for name, tensor in tensors.items():
-        at = place(tensor)
-        if at not in copies:
-            copies[at] = copy_of(tensor).contiguous()
-        named[name] = copies[at]
-    return named

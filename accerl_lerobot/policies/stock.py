@@ -73,14 +73,7 @@ class StockAdapter(PretrainedAdapter):
 
     def imitate(self, observations: Observations, tasks: Sequence[str], chunk: Tensor) -> tuple[Tensor, None]:
         batch = self._training_batch(observations, tasks, chunk)
-        self.policy.train()
-        for module in self.policy.modules():
-            if isinstance(module, nn.modules.batchnorm._BatchNorm):
-                module.eval()  # its running statistics are not published
-        try:
-            return self.policy.forward(batch)[0], None
-        finally:
-            self.policy.eval()
+        return _training_loss(self.policy, batch), None
 
     @torch.no_grad()
     def self_check(self) -> None:
@@ -108,11 +101,10 @@ class StockAdapter(PretrainedAdapter):
             )
         chunk = torch.zeros_like(first)
         self._check_targets(requests, chunk)
-        buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
+        batch = self._training_batch(*stack_observations(requests), chunk)
         with torch.random.fork_rng(), self.autocast():
-            self.imitate(*stack_observations(requests), chunk)
-            for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
-                buffer.copy_(buffers[name])
+            # Of a copy, as the loss may move buffers such as a codebook.
+            _training_loss(copy_sharing_weights(self.policy), batch)
 
     def _check_targets(self, requests: Sequence[Request], zeros: Tensor) -> None:
         """Refuses a policy that would be trained on other chunks (B, K, A) than it is told to imitate."""
@@ -245,6 +237,18 @@ def copy_sharing_weights(policy: Any) -> Any:
     """The policy with networks of its own, in which acting may leave tensors, and the same parameters."""
     with patch.object(nn.Parameter, "__deepcopy__", lambda parameter, memo: parameter):
         return copy.deepcopy(policy)
+
+
+def _training_loss(policy: Any, batch: dict[str, Any]) -> Tensor:
+    """LeRobot's loss, (B,) or its mean."""
+    policy.train()
+    for module in policy.modules():
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
+            module.eval()  # its running statistics are not published
+    try:
+        return policy.forward(batch)[0]
+    finally:
+        policy.eval()
 
 
 def _decision(chunk: np.ndarray, version: int) -> Decision:

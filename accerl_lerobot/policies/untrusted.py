@@ -35,10 +35,8 @@ FILES = (
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
 LARGE = 2**16  # numbers of a tensor that is not filled, see `Unfilled`
-FILLS = {
-    "normal_", "uniform_", "zero_", "fill_", "erfinv_", "trunc_normal_", "constant_", "ones_", "zeros_",
-    "kaiming_uniform_", "kaiming_normal_", "xavier_uniform_", "xavier_normal_", "orthogonal_",
-}  # fmt: skip
+FILLS = {"normal_", "uniform_", "zero_", "fill_", "erfinv_", "constant_", "kaiming_uniform_"}
+"""Functions in which all of `torch.nn.init` ends."""
 
 
 def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:

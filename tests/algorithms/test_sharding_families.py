@@ -64,7 +64,7 @@ def learn(case: Case, folder: Path, config: TrainerConfig) -> dict[str, Any]:
             for name, p in adapter.trainable().items()
         }
         metrics.append(update.step(batch))
-        saved = adapter.copy_weights().policy if case.kind == "smolvla" else {}
+        saved = adapter.copy_weights()["policy"] if case.kind == "smolvla" else {}
         return {
             "metrics": metrics,
             "gradients": gradients,
