@@ -19,6 +19,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
     EpisodeLabels,
     checked,
+    numbers,
     observations,
     open_metadata,
     opened,
@@ -55,6 +56,14 @@ def refused(root: Path, why: str) -> None:
     with pytest.raises(InputError, match=f"^dataset.root='.*': .*{why}") as caught:
         open_metadata(DatasetConfig(repo_id="a/b", root=str(root)))
     assert "\n" not in str(caught.value)
+
+
+def test_a_column_has_the_shape_of_its_feature(tmp_path: Path):
+    """Also a single number, which LeRobot stores without a dimension."""
+    dataset = write_dataset(tmp_path / "data", more={"observation.force": labels("float32")})
+    with opened(dataset, open_metadata(dataset)) as data:
+        for name, size in ((STATE, 4), ("observation.force", 1)):
+            assert numbers(data, name, dataset).shape == (2 * STEPS, size)
 
 
 def test_datasets_that_are_not_there(tmp_path: Path):

@@ -54,17 +54,7 @@ def test_what_no_action_depends_on_is_not_trained(adapter: LeRobotAdapter):
     for parameter in frozen.values():
         parameter.normal_()
     assert np.array_equal(np.stack([d.chunk for d in adapter.decide(asked, 0)]), before)
-    assert {k.split("with_expert.")[1] for k in frozen} == {
-        "paligemma.lm_head.weight",
-        "gemma_expert.lm_head.weight",
-        f"{LANGUAGE_MODEL}.norm.weight",
-        f"{LANGUAGE_MODEL}.layers.1.self_attn.q_proj.weight",
-        f"{LANGUAGE_MODEL}.layers.1.self_attn.o_proj.weight",
-        f"{LANGUAGE_MODEL}.layers.1.mlp.gate_proj.weight",
-        f"{LANGUAGE_MODEL}.layers.1.mlp.up_proj.weight",
-        f"{LANGUAGE_MODEL}.layers.1.mlp.down_proj.weight",
-        f"{LANGUAGE_MODEL}.layers.1.post_attention_layernorm.weight",
-    }
+    assert f"model.paligemma_with_expert.{LANGUAGE_MODEL}.layers.1.mlp.up_proj.weight" in frozen
 
 
 def test_a_bfloat16_checkpoint_acts_and_is_saved_in_float32(path: Path, tmp_path: Path):

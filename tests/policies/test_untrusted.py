@@ -158,14 +158,6 @@ def load(name: str, **options: Any) -> Any:
     return AutoConfig.from_pretrained(name, **options)
 
 
-def test_code_on_the_hub_is_refused(theirs: Repository):
-    with guarded("policy"), pytest.raises(InputError) as caught:
-        load(theirs.name, trust_remote_code=True)
-    assert str(caught.value).startswith("policy.trust_remote_code=") and "their_code.py" in str(caught.value)
-    assert "name its commit in policy.trust_remote_code" in caught.value.hint
-    assert not theirs.marker.exists()
-
-
 def test_code_in_a_folder_is_refused_even_where_a_commit_is_named(theirs: Repository, tmp_path: Path):
     folder = tmp_path / "downloaded"
     cached_repo(theirs.cache, theirs.name, COMMIT).rename(folder)
@@ -175,7 +167,10 @@ def test_code_in_a_folder_is_refused_even_where_a_commit_is_named(theirs: Reposi
     assert not theirs.marker.exists()
 
 
-def test_the_commit_that_is_named_is_run_and_no_other(theirs: Repository):
+def test_code_on_the_hub_is_run_of_the_commit_that_is_named_and_of_no_other(theirs: Repository):
+    with guarded("policy"), pytest.raises(InputError, match="^policy.trust_remote_code=.*their_code.py") as e:
+        load(theirs.name, trust_remote_code=True)
+    assert "name its commit in policy.trust_remote_code" in e.value.hint
     with guarded("policy", "f" * 40), pytest.raises((OSError, InputError)):
         load(theirs.name, trust_remote_code=True)
     assert not theirs.marker.exists()
@@ -230,26 +225,23 @@ class Mark:
         return Path.touch, (self.path,)
 
 
-def test_nothing_is_unpickled(tmp_path: Path):
-    marker = tmp_path / "was-run"
-    (tmp_path / "pytorch_model.bin").write_bytes(pickle.dumps(Mark(marker)))
-    with guarded("policy"), pytest.raises(InputError, match="a pickle, which may run code"):
-        torch.load(tmp_path / "pytorch_model.bin", weights_only=False)
-    assert not marker.exists()
-    torch.save({"a": torch.zeros(2)}, tmp_path / "a.pt")
-    assert torch.load(tmp_path / "a.pt", weights_only=True)["a"].shape == (2,), "the patch is undone"
-
-
-def test_weights_from_pytorch_itself_are_read_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    torch.save({"a": torch.ones(2)}, tmp_path / "resnet.pth")
-    marker = tmp_path / "was-run"
-    (tmp_path / "other.pth").write_bytes(pickle.dumps(Mark(marker)))
+def test_nothing_is_unpickled_and_weights_from_pytorch_itself_are_read_as_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    marker, hub = tmp_path / "was-run", tmp_path / "hub"
+    hub.mkdir()
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(hub))
+    for folder in (tmp_path, hub):
+        (folder / "other.bin").write_bytes(pickle.dumps(Mark(marker)))
+        torch.save({"a": torch.ones(2)}, folder / "good.pt")
     with guarded("policy"):
-        assert torch.load(tmp_path / "resnet.pth", weights_only=False)["a"].sum() == 2
+        with pytest.raises(InputError, match="a pickle, which may run code"):
+            torch.load(tmp_path / "other.bin", weights_only=False)
         with pytest.raises(pickle.UnpicklingError):
-            torch.load(tmp_path / "other.pth", weights_only=False)
+            torch.load(hub / "other.bin", weights_only=False)
+        assert torch.load(hub / "good.pt", weights_only=False)["a"].sum() == 2
     assert not marker.exists()
+    assert torch.load(tmp_path / "good.pt", weights_only=True)["a"].sum() == 2, "the patch is undone"
 
 
 def test_large_parameters_are_not_filled_and_all_else_is():
