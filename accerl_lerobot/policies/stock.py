@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, in_one_line
 from accerl_lerobot.experience import Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, executed_rows
@@ -53,6 +53,8 @@ class StockAdapter(PretrainedAdapter):
         super().__init__(policy, processing, precision)
         self._sampler = sampler
         self.explores = sampler is not None
+        self._takes_batches = True
+        self._one_at_a_time = False
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
 
     @torch.no_grad()
@@ -65,17 +67,27 @@ class StockAdapter(PretrainedAdapter):
     def try_out(self) -> None:
         """Lets the policy act once, before any episode has a policy object of its own.
 
-        Some load a text encoder only then, whose weights all episodes share from now on.
+        Some load a text encoder only then, which all episodes share from now on. Where acting leaves tensors
+        in the policy's networks, and `reset` removes them, the networks hold the state of one episode.
         """
+        networks = [vars(module) for module in self.policy.modules() if module is not self.policy]
         action = self._act(self.policy, self.example_requests()[0])
         self.processing.unnormalise(action)
+        acted = tensors_in(networks)
         self.policy.reset()
+        self._one_at_a_time = acted > tensors_in(networks)
 
     def imitate(self, observations: Observations, tasks: Sequence[str], chunk: Tensor) -> tuple[Tensor, None]:
         batch = self._training_batch(observations, tasks, chunk)
-        return _training_loss(self.policy, batch), None
+        self.policy.train()
+        for module in self.policy.modules():
+            if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                module.eval()  # its running statistics are not published
+        try:
+            return self.policy.forward(batch)[0], None
+        finally:
+            self.policy.eval()
 
-    @torch.no_grad()
     def self_check(self) -> None:
         """Proves that the policy can be asked twice for a chunk, and that its training loss can be computed.
 
@@ -90,21 +102,34 @@ class StockAdapter(PretrainedAdapter):
             logger.warning(
                 "%s: LeRobot keeps %d of its trained tensors in bfloat16: %s", config.type, coarse, why
             )
-        later = max(config.observation_delta_indices or [0]) > 0
+        later = [delta for delta in config.observation_delta_indices or () if delta > 0]
         if later or config.reward_delta_indices is not None:
             raise self._unable("LeRobot trains it on what follows a chunk, rewards or observations")
         requests = self.example_requests()
-        first, second = (self._chunk(requests) for _ in range(2))
-        if not torch.equal(first, second):
-            raise self._unable(
-                "asked twice with the same noise, it gives two chunks: it changes while it acts"
+        first = self.decide(requests[:1], 0)[0].chunk
+        second = self.decide(requests[:1], 0)[0].chunk
+        if not np.array_equal(first, second):
+            why = "asked twice with the same noise, it gives two chunks: it changes while it acts"
+            raise self._unable(why)
+        try:
+            with torch.no_grad():
+                self._chunk(requests)
+        except Exception as error:  # a policy of another package, which may fail in any way
+            self._takes_batches = False
+            reason = in_one_line(error)
+            logger.warning(
+                "%s policies decide for one environment at a time, which takes as many calls as there are "
+                "environments: a batch of two fails (%s)",
+                config.type,
+                reason,
             )
-        chunk = torch.zeros_like(first)
+        chunk = torch.zeros(len(requests), *first.shape, device=self.device)
         self._check_targets(requests, chunk)
-        batch = self._training_batch(*stack_observations(requests), chunk)
-        with torch.random.fork_rng(), self.autocast():
-            # Of a copy, as the loss may move buffers such as a codebook.
-            _training_loss(copy_sharing_weights(self.policy), batch)
+        buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
+        with torch.no_grad(), torch.random.fork_rng(), self.autocast():
+            self.imitate(*stack_observations(requests), chunk)
+            for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
+                buffer.copy_(buffers[name])
 
     def _check_targets(self, requests: Sequence[Request], zeros: Tensor) -> None:
         """Refuses a policy that would be trained on other chunks (B, K, A) than it is told to imitate."""
@@ -114,9 +139,8 @@ class StockAdapter(PretrainedAdapter):
             prepared = self._training_batch(*stack_observations(requests), zeros + value)[ACTION]
             error = prepared[..., : len(varies)].float() - value
             if (error[..., varies].abs() > ROUNDED).any():
-                raise self._unable(
-                    "LeRobot's preprocessor does not undo what its postprocessor does to actions"
-                )
+                why = "LeRobot's preprocessor does not undo what its postprocessor does to actions"
+                raise self._unable(why)
 
     def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         raise self._unable("it has no likelihood here")
@@ -145,17 +169,24 @@ class StockAdapter(PretrainedAdapter):
         """The policy object of the request's episode; new, and reset, if this is its first decision.
 
         Raises:
-            InputError: the object of an episode under way is not here.
+            InputError: the policy acts in one environment at a time, and another episode has begun; or the
+                object of an episode under way is not here.
         """
         episode = episode_of(request.noise_seed), request.task
         begins = decision_of(request.noise_seed) == 0
-        if begins:  # perhaps once more, after a rollout worker was lost
-            self._episodes[episode] = copy_sharing_weights(self.policy)
-            self._episodes[episode].reset()
-        elif episode not in self._episodes:
+        latest = next(reversed(self._episodes), episode)
+        if self._one_at_a_time and not begins and latest != episode:
+            why = "its networks hold the state of one episode, so it acts in one environment at a time"
+            hint = f"{why}; set rollout.workers=1 and rollout.environments=1"
+            raise InputError("policy.type", self.policy.config.type, hint)
+        if not begins and episode not in self._episodes:
             why = "what it remembers of an episode is lost: its inference worker was replaced, or more than"
             hint = f"{why} {EPISODES} environments share one; evaluate again, with more inference.workers"
             raise InputError("policy.type", self.policy.config.type, hint)
+        if begins:  # perhaps once more, after a rollout worker was lost
+            memo = {id(part): part for part in shared_parts(self.policy)}
+            self._episodes[episode] = copy.deepcopy(self.policy, memo)
+            self._episodes[episode].reset()
         self._episodes.move_to_end(episode)
         if len(self._episodes) > EPISODES:
             self._episodes.popitem(last=False)
@@ -164,19 +195,20 @@ class StockAdapter(PretrainedAdapter):
     def _decide_chunks(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """Exploring environments are decided for together, the others one by one, each with its own noise."""
         assert self._sampler is not None
-        chunks: dict[int, Tensor] = {}
         exploring = [i for i, request in enumerate(requests) if request.explore]
-        if exploring:
-            together = self._chunk([requests[i] for i in exploring])
-            chunks |= dict(zip(exploring, together, strict=True))
-        for i, request in enumerate(requests):
-            if not request.explore:
-                chunks[i] = self._chunk([request])[0]
-                continue
-            generator = np.random.default_rng((request.noise_seed, NOISE))
-            noise = torch.from_numpy(generator.standard_normal(chunks[i].shape))
-            chunks[i] = chunks[i] + self._sampler.noise_level * noise.to(chunks[i])
+        together = exploring if self._takes_batches else []
+        groups = [[i] for i in range(len(requests)) if i not in together]
+        if together:
+            groups.append(together)
+        chunks: dict[int, Tensor] = {}
+        for rows in groups:
+            chunk = self._chunk([requests[i] for i in rows])
+            chunks |= dict(zip(rows, chunk, strict=True))
         executed = torch.stack([chunks[i] for i in range(len(requests))])
+        for i in exploring:
+            generator = np.random.default_rng((requests[i].noise_seed, NOISE))
+            noise = torch.from_numpy(generator.standard_normal(executed[i].shape))
+            executed[i] += self._sampler.noise_level * noise.to(executed)
         return [_decision(chunk, version) for chunk in self.execute(executed, requests)]
 
     def _chunk(self, requests: Sequence[Request]) -> Tensor:
@@ -233,22 +265,26 @@ class StockAdapter(PretrainedAdapter):
         return prepared
 
 
-def copy_sharing_weights(policy: Any) -> Any:
-    """The policy with networks of its own, in which acting may leave tensors, and the same parameters."""
-    with patch.object(nn.Parameter, "__deepcopy__", lambda parameter, memo: parameter):
-        return copy.deepcopy(policy)
+def shared_parts(policy: Any) -> list[Any]:
+    """All that the policy objects of different episodes share: config, networks and their weights.
+
+    Networks that PyTorch does not know as parts of the policy, as it keeps them in a dict, are among them.
+    """
+    parts = [policy.config, *policy.parameters(), *policy.buffers()]
+    for held in vars(policy).values():
+        for network in held.values() if isinstance(held, dict) else [held]:
+            if isinstance(network, nn.Module):
+                parts += network.modules()
+    return parts
 
 
-def _training_loss(policy: Any, batch: dict[str, Any]) -> Tensor:
-    """LeRobot's loss, (B,) or its mean."""
-    policy.train()
-    for module in policy.modules():
-        if isinstance(module, nn.modules.batchnorm._BatchNorm):
-            module.eval()  # its running statistics are not published
-    try:
-        return policy.forward(batch)[0]
-    finally:
-        policy.eval()
+def tensors_in(value: Any) -> int:
+    """Number of tensors in nested dicts, lists and tuples."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return sum(map(tensors_in, value))
+    return isinstance(value, Tensor)
 
 
 def _decision(chunk: np.ndarray, version: int) -> Decision:

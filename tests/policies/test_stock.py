@@ -9,7 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,17 @@ from tests.policies.checkpoints import (
 )
 from tests.policies.tiny import requests
 from tests.policies.tiny_pi import small, write_pi
-from tests.policies.tiny_vlms import wan_hub, write_eo1, write_evo1, write_fastwam, write_lingbot_va
+from tests.policies.tiny_vlms import (
+    wan_hub,
+    write_eo1,
+    write_evo1,
+    write_fastwam,
+    write_groot,
+    write_lingbot_va,
+    write_molmoact2,
+    write_vla_jepa,
+    write_wall_x,
+)
 from tests.tiny_datasets import record_dataset
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -104,12 +114,8 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
 
     path = written(kind)
     adapter = load_acting(config_of(path, kind))
-    check_loop(adapter, get_policy_class(kind).from_pretrained(path), steps=5)
-
-
-def check_loop(adapter: Any, stock: Any, steps: int) -> None:
-    """Two episodes at the same time are those that LeRobot's loop plays one after the other."""
-    episodes = [steps_of(episode, steps) for episode in (1, 2)]
+    stock = get_policy_class(kind).from_pretrained(path)
+    episodes = [steps_of(episode, 5) for episode in (1, 2)]
     found = [adapter.decide(list(asked), 3) for asked in zip(*episodes, strict=True)]
     for which, asked in enumerate(episodes):
         stock.reset()
@@ -123,7 +129,7 @@ def check_loop(adapter: Any, stock: Any, steps: int) -> None:
             assert decision.chunk.shape == (1, 2) and decision.version == 3 and not decision.log_prob.any()
 
 
-@pytest.mark.parametrize("write", [write_fastwam, write_lingbot_va])
+@pytest.mark.parametrize("write", [write_vla_jepa, write_fastwam, write_lingbot_va])
 def test_what_is_trained_on_later_images_acts_as_in_lerobot_s_loop(
     write: Callable[..., Path], tmp_path: Path
 ):
@@ -136,7 +142,18 @@ def test_what_is_trained_on_later_images_acts_as_in_lerobot_s_loop(
         stock = get_policy_class(PreTrainedConfig.from_pretrained(path).type).from_pretrained(path)
         with pytest.raises(InputError, match="LeRobot trains it on what follows a chunk"):
             learning(path)
-    check_loop(adapter, stock, steps=14)
+    for episode in (1, 2):
+        stock.reset()
+        for request in steps_of(episode, 14):
+            torch.manual_seed(request.noise_seed)
+            batch = adapter.processing.prepare(*stack_observations([request]))
+            expected = adapter.processing.postprocessor(stock.select_action(batch)).numpy()
+            np.testing.assert_array_equal(adapter.decide([request], 0)[0].chunk, expected)
+    if write is write_lingbot_va:
+        ended, *_ = steps_of(3, 1)
+        adapter.decide([ended], 0)
+        with pytest.raises(InputError, match="it acts in one environment at a time; set rollout.workers=1"):
+            adapter.decide([steps_of(2, 15)[-1]], 0)
 
 
 def test_an_episode_that_is_run_again_begins_anew(written: Any):
@@ -178,8 +195,13 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     assert cli.main(["eval", *fields, *policies["tdmpc"], *evaluation]) == 0
     found = json.loads((tmp_path / "eval" / "evaluation.json").read_text())
     assert found["n"] == 2 and found["steps_mean"] > 1
-    train = ["train", *fields, "--sft.steps=0", "--rollout.segment_length=100"]
-    train.append(f"--output_dir={tmp_path / 'new'}")
+    train = [
+        "train",
+        *fields,
+        "--sft.steps=0",
+        "--rollout.segment_length=100",
+        f"--output_dir={tmp_path / 'new'}",
+    ]
     for kind, algorithm, why in (
         ("tdmpc", "gipo", "LeRobot trains it on what follows a chunk"),
         ("vqbet", "gipo", "algorithm.type=gipo needs exact likelihoods, which smolvla, act, .* have here"),
@@ -194,10 +216,6 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     assert not (tmp_path / "new").exists()
 
 
-def write_vqbet(folder: Path, image: int) -> Path:
-    return write_policy(folder, "vqbet", image=image, **KINDS["vqbet"])
-
-
 def learning(path: Path, mode: Any = "checkpoint", **fields: Any) -> StockAdapter:
     """A policy of any type, loaded to learn."""
     sampler = ChunkNoiseConfig(**fields)
@@ -205,6 +223,20 @@ def learning(path: Path, mode: Any = "checkpoint", **fields: Any) -> StockAdapte
     adapter = load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, tuning=tuning))
     assert isinstance(adapter, StockAdapter)
     return adapter
+
+
+@pytest.mark.parametrize("write", [write_act, write_diffusion])
+def test_types_that_are_known_act_as_in_lerobot_s_loop(write: Callable[..., Path], tmp_path: Path):
+    adapter = learning(write(tmp_path / "policy", image=32))
+    (asked,) = requests(1, explore=False)
+    chunk = adapter.decide([asked], 0)[0].chunk
+    adapter.policy.reset()
+    torch.manual_seed(asked.noise_seed)
+    batch = adapter.processing.prepare(*stack_observations([asked]))
+    with torch.no_grad():
+        taken = [adapter.policy.select_action(dict(batch)) for _ in range(len(chunk))]
+    expected = [adapter.processing.postprocessor(action).numpy()[0] for action in taken]
+    np.testing.assert_allclose(chunk, np.stack(expected), atol=1e-5)
 
 
 def test_smolvla_s_training_loss_is_ours(tmp_path: Path):
@@ -227,27 +259,27 @@ def test_of_a_smolvla_with_noise_on_its_chunk_the_expert_alone_can_be_trained(tm
     assert trained and not [name for name in trained if ".vlm_with_expert.vlm." in name]
 
 
-@pytest.mark.parametrize("write", [write_act, write_diffusion, write_vqbet])
-def test_a_chunk_is_what_lerobot_s_loop_executes(write: Callable[..., Path], tmp_path: Path):
-    """VQ-BeT looks back, and is shown what LeRobot's loop would show it."""
-    adapter, steps = learning(write(tmp_path / "policy", image=64)), steps_of(4, 9)
-    stock = type(adapter.policy).from_pretrained(tmp_path / "policy")
+def test_a_policy_that_looks_back_is_shown_what_lerobot_s_loop_would_show_it(written: Any):
+    from lerobot.policies.factory import get_policy_class
+
+    path, steps = written("vqbet"), steps_of(4, 9)
+    adapter, stock = learning(path), get_policy_class("vqbet").from_pretrained(written("vqbet"))
+    stock.reset()
     taken = []
     for request in steps:
         torch.manual_seed(steps[6].noise_seed)
         batch = adapter.processing.prepare(*stack_observations([request]))
         taken.append(adapter.processing.postprocessor(stock.select_action(batch)).numpy()[0])
-    # The third chunk begins at step 6.
-    history = stock.config.n_obs_steps
-    seen = [request.observation for request in steps[7 - history : 7]]
-    observation = {k: v if k == "task" else np.stack([each[k] for each in seen]) for k, v in seen[0].items()}
-    asked = replace(steps[6], observation=observation if history > 1 else seen[0])
+    # The third chunk begins at step 6, and is predicted from steps 4 to 6.
+    seen = [request.observation for request in steps[4:7]]
+    observation = {k: v if k == "task" else np.stack([s[k] for s in seen]) for k, v in seen[0].items()}
+    asked = Request(observation=observation, noise_seed=steps[6].noise_seed, explore=False)
     chunk = adapter.decide([asked], 0)[0].chunk
     np.testing.assert_allclose(chunk, np.stack(taken[6:9]), atol=1e-5)
     assert "predict_action_chunk" not in vars(adapter.policy)
 
 
-def test_steps_rows_and_types_of_a_run_are_set_by_the_names_of_lerobot_s_config():
+def test_steps_and_rows_of_a_run_are_set_by_the_names_of_lerobot_s_config():
     from lerobot.policies.factory import make_policy_config
 
     config = make_policy_config("multi_task_dit", device="cpu", n_obs_steps=2, horizon=6, n_action_steps=3)
@@ -255,10 +287,6 @@ def test_steps_rows_and_types_of_a_run_are_set_by_the_names_of_lerobot_s_config(
     assert (config.num_inference_steps, config.num_integration_steps, config.n_action_steps) == (4, 4, 5)
     with pytest.raises(InputError, match="policy.n_action_steps=6: multi_task_dit: at most 5 rows"):
         override(config, PolicyConfig(n_action_steps=6))
-    config = make_policy_config("evo1", device="cpu")
-    for learns, kind in ((False, "bfloat16"), (True, "float32")):
-        override(config, PolicyConfig(), learns=learns)
-        assert config.vlm_dtype == kind
 
 
 def test_images_of_any_size_fit_a_policy_that_resizes_them():
@@ -289,11 +317,16 @@ def small_pi() -> Iterator[None]:
         yield
 
 
-def write_pi0(folder: Path, image: int, kind: str = "pi0") -> Path:
-    return write_pi(folder, kind)
+def write_vqbet(folder: Path, image: int) -> Path:
+    return write_policy(folder, "vqbet", image=image, **KINDS["vqbet"])
 
 
-write_pi05 = partial(write_pi0, kind="pi05")
+def write_pi0(folder: Path, image: int) -> Path:
+    return write_pi(folder, "pi0")
+
+
+def write_pi05(folder: Path, image: int) -> Path:
+    return write_pi(folder, "pi05")
 
 
 @pytest.fixture(scope="module")
@@ -308,6 +341,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, bool], 
     return record
 
 
+NEEDED = {write_wall_x: ("torchdiffeq", "qwen_vl_utils"), write_groot: ("tree",)}
+"""Packages that some of LeRobot's policies need and that this package does not."""
+
+
 @pytest.mark.parametrize(
     ("write", "algorithm"),
     [
@@ -319,7 +356,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, bool], 
                 (write_vqbet, "self_imitation"), (write_xvla, "chunk_critic"), (write_act, "self_imitation"),
                 (write_diffusion, "chunk_critic"), (write_smolvla, "self_imitation"),
                 (write_pi0, "chunk_critic"), (write_pi05, "self_imitation"), (write_eo1, "chunk_critic"),
-                (write_evo1, "self_imitation"),
+                (write_evo1, "self_imitation"), (write_molmoact2, "self_imitation"),
+                (write_wall_x, "self_imitation"), (write_groot, "chunk_critic"),
             )
         ),
     ],
@@ -335,11 +373,16 @@ def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
+    for package in NEEDED.get(write, ()):
+        pytest.importorskip(package)
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 8)
     size = 64 if write in (write_vqbet, write_multi_task_dit, write_xvla) else 32
-    policy, out = write(tmp_path / "policy", image=size), tmp_path / "run"
-    states = algorithm == "chunk_critic"
+    policy, states, out = (
+        write(tmp_path / "policy", image=size),
+        algorithm == "chunk_critic",
+        tmp_path / "run",
+    )
     env = ["--env.type=simulated", "--env.max_steps=12", f"--env.image_size={size}"]
     env += [f"--env.environment_state={str(states).lower()}"]
     fields = [
@@ -424,6 +467,34 @@ def test_a_backbone_s_weights_that_the_checkpoint_has_are_not_wanted(tmp_path: P
     assert adapter.policy.config.pretrained_path is None
 
 
+def test_a_policy_that_learns_does_so_in_float32():
+    from lerobot.policies.factory import make_policy_config
+
+    config = make_policy_config("evo1", device="cpu")
+    override(config, PolicyConfig())
+    assert config.vlm_dtype == "bfloat16"
+    override(config, PolicyConfig(), learns=True)
+    assert config.vlm_dtype == "float32"
+
+
+def test_a_policy_that_takes_no_batch_decides_one_by_one(
+    written: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    stock = VQBeTPolicy.select_action
+
+    def one_at_a_time(self: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        if len(batch["observation.state"]) > 1:
+            raise RuntimeError("one at a time, please")
+        return stock(self, batch)
+
+    monkeypatch.setattr(VQBeTPolicy, "select_action", one_at_a_time)
+    adapter = learning(written("vqbet"))
+    assert "vqbet policies decide for one environment at a time" in caplog.text
+    assert len(adapter.decide(adapter.example_requests(), 0)) == 2
+
+
 def test_a_policy_that_changes_while_it_acts_is_refused(written: Any, monkeypatch: pytest.MonkeyPatch):
     from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 
@@ -447,6 +518,9 @@ def test_actions_that_lerobot_does_not_bring_back_are_refused(written: Any, monk
     monkeypatch.setattr(Processing, "unnormalise", whole)
     with pytest.raises(InputError, match="policy.type='vqbet': LeRobot's preprocessor does not undo"):
         learning(written("vqbet"))
-    # If none varies, that is no reason to refuse.
+
+
+def test_actions_of_which_none_varies_are_no_reason_to_refuse(written: Any, monkeypatch: pytest.MonkeyPatch):
+    stock = Processing.unnormalise
     monkeypatch.setattr(Processing, "unnormalise", lambda self, chunk: 0 * stock(self, chunk) + 0.3)
     learning(written("vqbet"))

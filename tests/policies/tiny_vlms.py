@@ -7,15 +7,18 @@ Each backbone, with its tokeniser, is written beside the policy's folder.
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from safetensors.torch import save_file
 
 from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import write_policy
-from tests.policies.tiny_pi import COMMIT
+from tests.policies.tiny_pi import COMMIT, write_fast
 
 TEMPLATE = (
     "{% for message in messages %}<|im_start|>{{ message['role'] }}\n"
@@ -50,14 +53,20 @@ def write_letters(folder: Path, *marks: str, **options: Any) -> Any:
     return tokenizer
 
 
-def write_qwen25_vl(folder: Path) -> dict[str, Any]:
-    """The processor of a Qwen2.5-VL of one layer; returns its config."""
+def token_ids(tokenizer: Any) -> dict[str, Any]:
+    """Fields of the config of a Qwen-VL that name tokens."""
+    ids: dict[str, Any] = {"dtype": "float32"}
+    for name, mark in NAMED.items():
+        ids[f"{name}_token_id"] = tokenizer.convert_tokens_to_ids(f"<|{mark}|>")
+    return ids
+
+
+def write_qwen25_vl(folder: Path, *marks: str) -> tuple[dict[str, Any], Any]:
+    """The processor of a Qwen2.5-VL of one layer, with more `marks`; returns its config and the tokeniser."""
     from transformers import Qwen2_5_VLProcessor, Qwen2VLImageProcessor, Qwen2VLVideoProcessor
 
-    tokenizer = write_letters(folder, *(f"<|{mark}|>" for mark in MARKS))
-    config: dict[str, Any] = {"dtype": "float32"}
-    for name, mark in NAMED.items():
-        config[f"{name}_token_id"] = tokenizer.convert_tokens_to_ids(f"<|{mark}|>")
+    tokenizer = write_letters(folder, *(f"<|{mark}|>" for mark in MARKS), *marks)
+    config = token_ids(tokenizer)
     config["text_config"] = {
         "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_hidden_layers": 1, "num_attention_heads": 2,
         "num_key_value_heads": 1, "vocab_size": len(tokenizer) + ROOM, "max_position_embeddings": 4096,
@@ -66,7 +75,7 @@ def write_qwen25_vl(folder: Path) -> dict[str, Any]:
     config["vision_config"] = VISION | {"window_size": 56, "fullatt_block_indexes": [0]}
     images = Qwen2VLImageProcessor(min_pixels=28 * 28, max_pixels=56 * 56)
     Qwen2_5_VLProcessor(images, tokenizer, Qwen2VLVideoProcessor(), TEMPLATE).save_pretrained(folder)
-    return config
+    return config, tokenizer
 
 
 def write_eo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
@@ -75,7 +84,7 @@ def write_eo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
     from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
     backbone = directory.parent / f"{directory.name}-qwen"
-    config = write_qwen25_vl(backbone)
+    config, _ = write_qwen25_vl(backbone)
     torch.manual_seed(0)
     Qwen2_5_VLForConditionalGeneration(Qwen2_5_VLConfig(**config)).save_pretrained(backbone)
     fields = {
@@ -122,6 +131,175 @@ def write_evo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
         "num_inference_timesteps": 2,
     }  # fmt: skip
     return write_policy(directory, "evo1", image=image, **(fields | options))
+
+
+def write_molmo(folder: Path, fast: Path, state_tokens: int) -> None:
+    """A MolmoAct2 model of one layer with its processor, an image being one token of it.
+
+    `fast` is written, too: its tokeniser of actions.
+    """
+    import torch
+    from lerobot.policies.molmoact2.molmoact2_hf_model.configuration_molmoact2 import MolmoAct2Config
+    from lerobot.policies.molmoact2.molmoact2_hf_model.modeling_molmoact2 import (
+        MolmoAct2ForConditionalGeneration,
+    )
+    from transformers import PreTrainedTokenizerFast
+
+    write_fast(fast)
+    count = len(PreTrainedTokenizerFast.from_pretrained(fast))
+    marks = {
+        "image_patch_id": "<im_patch>", "image_low_res_id": "<im_low>", "image_start_token_id": "<im_start>",
+        "low_res_image_start_token_id": "<low_res_im_start>", "frame_start_token_id": "<frame_start>",
+        "image_end_token_id": "<im_end>", "frame_end_token_id": "<frame_end>", "image_col_id": "<im_col>",
+        "action_output_token_id": "<action_output>", "action_start_token_id": "<action_start>",
+        "action_end_token_id": "<action_end>", "state_start_token_id": "<state_start>",
+        "state_end_token_id": "<state_end>",
+    }  # fmt: skip
+    states = [f"<state_{i}>" for i in range(state_tokens)]
+    actions = [f"<action_{i}>" for i in range(count)]
+    tokenizer = write_letters(
+        folder, "<|im_start|>", "<|im_end|>", *marks.values(), *states, *actions, padding_side="left"
+    )
+    ids = {name: tokenizer.convert_tokens_to_ids(mark) for name, mark in marks.items()}
+    heads = {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": WIDTH // 2}
+    sizes = {"hidden_size": WIDTH, "intermediate_size": WIDTH}
+    torch.manual_seed(0)
+    config = MolmoAct2Config(
+        vit_config=heads | sizes | {
+            "num_hidden_layers": 1, "image_default_input_size": (28, 28), "image_num_pos": 4,
+        },
+        adapter_config=heads | sizes | {"vit_layers": (-1,), "text_hidden_size": WIDTH},
+        text_config=heads | sizes | {
+            "num_hidden_layers": 1, "vocab_size": len(tokenizer), "additional_vocab_size": 8,
+        },
+        action_expert_config={
+            "hidden_size": WIDTH, "num_layers": 1, "num_heads": 2, "ffn_multiple_of": 8,
+            "timestep_embed_dim": 8,
+        },
+        action_token_start_id=tokenizer.convert_tokens_to_ids(actions[0]), num_action_tokens=count,
+        state_token_start_id=tokenizer.convert_tokens_to_ids(states[0]), num_state_tokens=state_tokens,
+        eos_token_id=tokenizer.eos_token_id, **ids,
+    )  # fmt: skip
+    MolmoAct2ForConditionalGeneration(config).save_pretrained(folder)
+    images = {"size": {"height": 28, "width": 28}, "crop_mode": "resize"}
+    (folder / "processor_config.json").write_text(json.dumps({"image_processor": images}))
+
+
+def write_molmoact2(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A MolmoAct2 with flow and tokens of actions."""
+    backbone = directory.parent / f"{directory.name}-molmo"
+    fast = backbone.with_name(f"{backbone.name}-fast")
+    write_molmo(backbone, fast, 4)
+    fields = {
+        "checkpoint_path": str(backbone), "discrete_action_tokenizer": str(fast), "num_state_tokens": 4,
+        "chunk_size": 4, "n_action_steps": 4, "inference_action_mode": "continuous",
+        "max_sequence_length": 1024, "num_flow_timesteps": 2, "num_inference_steps": 2,
+    }  # fmt: skip
+    return write_policy(directory, "molmoact2", image=image, **(fields | options))
+
+
+def write_wall_x(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A Wall-X on a tiny Qwen2.5-VL with two experts."""
+    import torch
+    from lerobot.policies.wall_x.modeling_wall_x import Qwen2_5_VLMoEForAction
+    from lerobot.policies.wall_x.qwen_model.configuration_qwen2_5_vl import Qwen2_5_VLConfig
+
+    backbone = directory.parent / f"{directory.name}-qwen"
+    config, tokenizer = write_qwen25_vl(backbone, "<|action|>", "<|propri|>")
+    expert = {"hidden_size": WIDTH, "intermediate_size": WIDTH, "hidden_act": "silu"}
+    config["text_config"] |= {
+        "mlp_moe": True, "num_experts": 2, "experts": [expert, expert], "dim_inputs": [WIDTH, WIDTH],
+        "dof_config": {"joints": 4}, "vocab_size": len(tokenizer),
+    }  # fmt: skip
+    torch.manual_seed(0)
+    qwen = Qwen2_5_VLConfig(agent_pos_config={"joints": 4}, **config)
+    qwen.save_pretrained(backbone)
+    model = Qwen2_5_VLMoEForAction(qwen, processor=SimpleNamespace(tokenizer=tokenizer))
+    save_file(model.state_dict(), backbone / "model.safetensors")
+    fields = {
+        "pretrained_name_or_path": str(backbone), "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 4,
+        "max_action_dim": 4,
+    }  # fmt: skip
+    return write_policy(directory, "wall_x", image=image, **(fields | options))
+
+
+def write_qwen3_vl(folder: Path) -> dict[str, Any]:
+    """The processor of a Qwen3-VL of one layer; returns its config."""
+    from transformers import Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
+
+    tokenizer = write_letters(folder, *(f"<|{mark}|>" for mark in MARKS), chat_template=TEMPLATE)
+    images = Qwen2VLImageProcessor(min_pixels=32 * 32, max_pixels=64 * 64, patch_size=16)
+    Qwen3VLProcessor(images, tokenizer, Qwen3VLVideoProcessor(), TEMPLATE).save_pretrained(folder)
+    config = token_ids(tokenizer)
+    config["text_config"] = {
+        "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_hidden_layers": 1, "num_attention_heads": 2,
+        "num_key_value_heads": 1, "head_dim": 8, "vocab_size": len(tokenizer) + ROOM,
+        "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [2, 1, 1]},
+    }  # fmt: skip
+    config["vision_config"] = VISION | {"num_position_embeddings": 16, "deepstack_visual_indexes": [0]}
+    return config
+
+
+def write_groot(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A GR00T N1.7 on a tiny Qwen3-VL."""
+    import torch
+    from lerobot.policies.groot.groot_n1_7 import GR00TN17, GR00TN17Config
+    from transformers import Qwen3VLConfig
+
+    qwen, base = (directory.parent / f"{directory.name}-{part}" for part in ("qwen", "groot"))
+    Qwen3VLConfig(**write_qwen3_vl(qwen)).save_pretrained(qwen)
+    attention = {"num_attention_heads": 2, "attention_head_dim": 8, "dropout": 0.0, "final_dropout": False}
+    torch.manual_seed(0)
+    config = GR00TN17Config(
+        model_name=str(qwen), select_layer=1, backbone_embedding_dim=WIDTH, hidden_size=WIDTH,
+        input_embedding_dim=WIDTH, max_state_dim=8, max_action_dim=4, action_horizon=4, max_seq_len=16,
+        diffusion_model_cfg=attention | {
+            "num_layers": 2, "output_dim": WIDTH, "norm_type": "ada_norm", "interleave_self_attention": True,
+            "positional_embeddings": None,
+        },
+        vl_self_attention_cfg=attention | {"num_layers": 1, "positional_embeddings": None},
+        num_inference_timesteps=2,
+    )  # fmt: skip
+    GR00TN17(config, load_backbone_weights=False).save_pretrained(base)
+    fields = {
+        "base_model_path": str(base), "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 8,
+        "max_action_dim": 4,
+    }  # fmt: skip
+    path = write_policy(directory, "groot", image=image, **(fields | options))
+    processor = path / "policy_preprocessor.json"
+    processor.write_text(processor.read_text().replace("nvidia/Cosmos-Reason2-2B", str(qwen)))
+    return path
+
+
+def write_vla_jepa(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A VLA-JEPA on a tiny Qwen3-VL, with a tiny V-JEPA 2 for its world model."""
+    import torch
+    from transformers import (
+        Qwen3VLConfig,
+        Qwen3VLForConditionalGeneration,
+        VJEPA2Config,
+        VJEPA2Model,
+        VJEPA2VideoProcessor,
+    )
+
+    qwen, jepa = (directory.parent / f"{directory.name}-{part}" for part in ("qwen", "jepa"))
+    torch.manual_seed(0)
+    Qwen3VLForConditionalGeneration(Qwen3VLConfig(**write_qwen3_vl(qwen))).save_pretrained(qwen)
+    config = VJEPA2Config(
+        crop_size=32, frames_per_clip=4, hidden_size=WIDTH, num_attention_heads=2, num_hidden_layers=1,
+        mlp_ratio=1.0, pred_hidden_size=WIDTH, pred_num_attention_heads=2, pred_num_hidden_layers=1,
+    )  # fmt: skip
+    VJEPA2Model(config).save_pretrained(jepa)
+    VJEPA2VideoProcessor(size={"shortest_edge": 32}, crop_size=32).save_pretrained(jepa)
+    fields = {
+        "qwen_model_name": str(qwen), "jepa_encoder_name": str(jepa), "chunk_size": 4, "n_action_steps": 4,
+        "num_video_frames": 4, "num_action_tokens_per_timestep": 2,
+        "num_embodied_action_tokens_per_instruction": 4, "num_inference_timesteps": 2,
+        "action_hidden_size": WIDTH, "action_num_layers": 1, "action_num_heads": 2,
+        "action_attention_head_dim": 8, "num_target_vision_tokens": 4, "predictor_depth": 1,
+        "predictor_num_heads": 2, "gripper_dim": 1,
+    }  # fmt: skip
+    return write_policy(directory, "vla_jepa", image=image, **(fields | options))
 
 
 def write_wan(folder: Path) -> None:
