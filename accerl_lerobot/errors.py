@@ -9,7 +9,6 @@ each of them once (`show_warnings`). The exception that ends a child is handed o
 from __future__ import annotations
 
 import contextlib
-import errno
 import functools
 import logging
 import math
@@ -122,15 +121,6 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
         known.append(error)
         yield error
         error = error.__cause__ or error.__context__
-
-
-def is_full(error: BaseException | None) -> bool:
-    """True if an error is that of a full disk, here or in a worker whose error carries the text."""
-    words = os.strerror(errno.ENOSPC)
-    for link in causes(error):
-        if getattr(link, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or words in str(link):
-            return True
-    return False
 
 
 def expanded(path: str, field: str) -> Path:

@@ -50,7 +50,7 @@ from accerl_lerobot.checkpoint.layout import (
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID
-from accerl_lerobot.engines import Progress, Saved, local
+from accerl_lerobot.engines import Progress, local
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate, drawing
@@ -152,8 +152,8 @@ def bench_study(config: BenchStudyConfig) -> dict[str, Any]:
             starts[made] = _start(config, cell, made)
         runs[root / cell.folder] = _run(config, cell, starts[made], made, root / cell.folder)
         held_back[root / cell.folder] = cell.hold_back
-    for folder, start in starts.items():
-        check_start(replace(start, resume=folder.exists()))  # a run that is there is resumed
+    for start in starts.values():
+        check_start(start)
     _do("SFT policies", starts, {}, config.jobs, console)
     _do("cells", runs, held_back, config.jobs, console)
     rows = [_row(root, cell) for cell in cells]
@@ -247,6 +247,8 @@ def train(folder: Path, config: RunConfig, hold_back: int) -> None:
 class HeldBackEngine(local.LocalEngine):
     """The engine of one process, whose acting policy has weights that are `hold_back` updates old."""
 
+    state_name = "local_held_back"  # without `main`, a run cannot be resumed, which would lose its lag
+
     def __init__(
         self,
         hold_back: int,
@@ -278,7 +280,7 @@ class HeldBackEngine(local.LocalEngine):
             self._acting.load_trainable(weights)
         return replace(progress, inference={"version": float(self._acting_version)})
 
-    def save(self, directory: Path) -> Saved:
+    def save(self, directory: Path) -> Progress:
         saved = super().save(directory)
         acting = {"version": self._acting_version, "weights": self._acting.export_trainable()}
         state = {"acting": acting, "waiting": list(self._held_back)}

@@ -69,8 +69,9 @@ def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[C
     monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
     made: list[RayEngine] = []
 
-    def make(state: Path | None = None, **sections: Any) -> RayEngine:
-        made.append(ray_engine.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
+    def make(state: Path | None = None, learns: bool = True, **sections: Any) -> RayEngine:
+        config = tiny_run(Path("nowhere"), **sections)
+        made.append(ray_engine.RayEngine(config, ("match",), state=state, learns=learns))
         return made[-1]
 
     yield make

@@ -220,9 +220,12 @@ class TestPreflight:
         [
             ({"type": "smol"}, "sft.policy.type='smol': no such policy type here; install the package"),
             ({"type": "smolvla", "chunks": 3}, "sft.policy.chunks=3: LeRobot's smolvla has no such field"),
-            ({"type": "smolvla", "num_steps": "x"}, "sft.policy.num_steps='x': LeRobot says: "),
+            (
+                {"type": "smolvla", "num_steps": "x"},
+                "sft.policy={'num_steps': 'x'}: LeRobot says: `num_steps`: ",
+            ),
             ({"type": "smolvla", "num_steps": 0}, "sft.policy.num_steps=0: use a whole number in [1, "),
-            ({"type": "smolvla", "chunk_size": 10}, "sft.policy={'chunk_size': 10}: LeRobot says: The chunk"),
+            ({"type": "smolvla", "chunk_size": 10}, "sft.policy={'chunk_size': 10}: LeRobot says: Couldn't"),
         ],
     )
     def test_refuses(self, policy: dict[str, Any], message: str) -> None:

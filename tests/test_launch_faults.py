@@ -83,6 +83,13 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine, monkeypatch,
     assert warnings == [("accerl_lerobot.envs", "info has no is_success")]
 
 
+def test_an_evaluation_has_no_trainer(engine):
+    one = engine(learns=False)
+    assert set(one.pids()) == {"inference", "replay", "rollout 0"}
+    one.plan(evaluation_plans(("match",), 5, "eval"))
+    assert len(collect(one, "eval", 5)) == 5
+
+
 def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine):
     launch = LaunchConfig(max_restarts=2)
     one = engine(env=LatencyConfig(crash_after=30), rollout=RolloutConfig(environments=2), launch=launch)

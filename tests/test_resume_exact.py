@@ -16,13 +16,10 @@ from accerl_lerobot.engines import Progress
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.run.resuming import check_engine
 from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.latent import LatentModel
-from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import ALGORITHMS, drive, local_engine, off_policy_run, tiny_run, trained, until, updates
 from tests.timeline.folders import adds_up
 
@@ -102,7 +99,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     first = begin(tiny_checkpoint, case)
     before = until(first, left_at)
     saved = first.save(tmp_path)
-    assert saved == (before[-1].version, [])
+    assert (saved.version, saved.updates) == (before[-1].version, [])
     if case == "ratio":
         assert told(before + drive(first)) == expected, "saving changes nothing"
     first.close()
@@ -122,15 +119,6 @@ def test_a_run_left_before_it_began_learning(tiny_checkpoint: Path, tmp_path: Pa
     again = LocalEngine(config, ("match",), state=tmp_path / TRAINING_STATE)
     again.train()
     assert told(drive(first)) == told(drive(again))
-
-
-def test_a_checkpoint_of_the_other_engine_is_refused(tiny_checkpoint: Path, tmp_path: Path):
-    LocalEngine(tiny_run(tiny_checkpoint), ("match",)).save(tmp_path)
-    check_engine("local", tmp_path)
-    with pytest.raises(InputError, match=r"launch\.engine='ray': this run was in one process"):
-        check_engine("ray", tmp_path)
-    with pytest.raises(InputError, match=r"launch\.engine='local': this run was asynchronous"):
-        check_engine("local", tmp_path / "another")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -154,13 +142,6 @@ def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
     assert max(u["logprob/mismatch_max"] for u in found) <= 1e-4
     assert all(u["logprob/mismatch_clip"] == 0.0 for u in found)
     assert max(u["ratio_max_dev"] for u in found[1:]) > 1e-3, "the weights should have moved"
-
-
-def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Path):
-    config = tiny_run(tiny_checkpoint, env=LatencyConfig(max_steps=16, nan_after=21))
-    history, _ = trained(config)
-    assert history[-1].done and history[-1].rollout["dropped_nonfinite"] > 0
-    assert history[-1].replay["dropped_nonfinite"] == 0, "the runner should have kept it from replay"
 
 
 def test_it_is_one_row_of_the_timeline(tiny_checkpoint: Path, tmp_path: Path):

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from accerl_lerobot.config.machine import GIB, memory_gib
 from accerl_lerobot.engines.config import lag_limits
-from accerl_lerobot.errors import InputError, in_one_line
+from accerl_lerobot.errors import InputError, check_absent, expanded, in_one_line
 
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import RunConfig
@@ -137,6 +137,8 @@ def recipe(arguments: list[str]) -> Iterator[Check]:
     from accerl_lerobot.run.preflight import check_start
     from accerl_lerobot.world_model.imagined import check_imagination
 
+    if config.output_dir is not None and not config.resume:
+        check_absent(expanded(config.output_dir, "output_dir"))
     check_start(config)
     yield Check("recipe", OK, "resolves")
     yield rendering(needed=config.env.type in ("metaworld", "libero"))

@@ -40,7 +40,7 @@ from accerl_lerobot.cli.export import ExportConfig, export_config, export_episod
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.console import Console, count, duration, number, rate
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback
+from accerl_lerobot.errors import InputError, check_absent, expanded, kept_traceback
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.config import Load
@@ -57,7 +57,7 @@ OUTCOME = (
 def train(arguments: list[str], load: Load | None = None) -> int:
     """``accerl train``; `load` makes the policy's adapter, of LeRobot's checkpoint by default."""
     config: RunConfig = parse(RunConfig, arguments)
-    from accerl_lerobot.engines.stopping import StoppedError, WorkerError
+    from accerl_lerobot.engines.stopping import StoppedError
     from accerl_lerobot.run import train as run
 
     console = Console()
@@ -66,10 +66,6 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     except StoppedError as stopped:
         console.say(str(stopped))
         return 128 + stopped.number
-    except BaseException as error:
-        if is_full(error) or (isinstance(error, WorkerError) and error.brief):
-            return 1  # `start` has said it
-        raise
     success = rate(summary["success_after"], summary["ci95_after"])
     if summary["success_before"] is not None:
         before = rate(summary["success_before"], summary["ci95_before"])

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -29,13 +29,6 @@ class Progress:
     replay: dict[str, float] = field(default_factory=dict)
     inference: dict[str, float] = field(default_factory=dict)
     world_model: dict[str, float] = field(default_factory=dict)  # empty where no imagined one learns
-
-
-class Saved(NamedTuple):
-    """Version of the policy in a checkpoint, and metrics of updates that `Engine.poll` will not report."""
-
-    version: int
-    updates: list[dict[str, float]]
 
 
 class Engine(ABC):
@@ -64,9 +57,10 @@ class Engine(ABC):
         """Do or await a little work and report it."""
 
     @abstractmethod
-    def save(self, directory: Path) -> Saved:
+    def save(self, directory: Path) -> Progress:
         """Write a checkpoint's ``pretrained_model`` and ``training_state``, see `checkpoint`.
 
+        Returns its version, and the metrics of updates that `poll` will not report.
         All parts are of the same update: no segment counts as learned from that was used later, and no
         planned episode is reported twice.
         """

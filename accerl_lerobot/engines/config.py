@@ -145,13 +145,6 @@ class RunConfig(Section):
             return self.world_model
         return default_state_model(self.env.tells_state)
 
-    @property
-    def remembered(self) -> int:
-        """Decisions in the trainer's own memory at the end."""
-        if not isinstance(self.algorithm, OffPolicyConfig):
-            return 0
-        return min(self.algorithm.memory, self.trainer.updates * self.trainer.batch_decisions)
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.policy.path is not None and self.sft.steps:

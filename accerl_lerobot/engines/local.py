@@ -17,7 +17,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engines import Engine, Progress, Saved
+from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.experience import REAL, Decision, Request, Segment
@@ -37,11 +37,13 @@ from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 
 logger = logging.getLogger(__name__)
 
-LOCAL = "local"  # name of this engine's own state
+LOCAL = "local"
 
 
 class LocalEngine(Engine):
     """Single-process engine."""
+
+    state_name = LOCAL  # of this engine's own part of a checkpoint
 
     def __init__(
         self,
@@ -127,7 +129,7 @@ class LocalEngine(Engine):
             inference={"version": float(self._update.version)},
         )
 
-    def save(self, directory: Path) -> Saved:
+    def save(self, directory: Path) -> Progress:
         self._clock.enter(CHECKPOINT)
         self._adapter.save(directory / PRETRAINED, self._adapter.copy_weights())
         state = directory / TRAINING_STATE
@@ -141,7 +143,7 @@ class LocalEngine(Engine):
             "plans": self._plans.state(),
             "runner": self._runner.state(),
         }
-        snapshot.save(state / LOCAL, engine)
+        snapshot.save(state / self.state_name, engine)
         if self._world_learner is not None:
             from accerl_lerobot.checkpoint.tensors import copied
             from accerl_lerobot.world_model.online import ONLINE, save_online
@@ -150,13 +152,13 @@ class LocalEngine(Engine):
             snapshot.save(state / ONLINE, {"learner": self._world_learner.state(), "acting": acting})
             save_online(directory, self._world_learner)
         self._clock.enter(WAIT_IN)
-        return Saved(self._update.version, [])
+        return Progress(version=self._update.version)
 
     def _restore(self, directory: Path) -> None:
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
         self._replay.restore(snapshot.load(directory / "replay"))
-        engine = snapshot.load(directory / LOCAL)
+        engine = snapshot.load(directory / self.state_name)
         self._rng = engine["rng"]
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])

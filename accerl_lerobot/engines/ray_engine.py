@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ import ray
 from ray.exceptions import RayError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
-from accerl_lerobot.engines import Engine, Progress, Saved
+from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.ray_session import NO_HUB_TOKEN, learns_states, place_workers, start_ray
 from accerl_lerobot.engines.stopping import WorkerError
@@ -39,7 +39,6 @@ from accerl_lerobot.engines.supervision import (
     has_died,
     restore_rollouts,
     save_rollouts,
-    show_new_warnings,
     total_counters,
 )
 from accerl_lerobot.inference.batcher import merge_metrics
@@ -63,6 +62,13 @@ class InferenceReplica(RestartedWorker):
     def ready_arguments(self) -> tuple[Any, ...]:
         return () if self.trainer is None else (self.trainer,)
 
+    def begin(self) -> None:
+        self.started(self.actor.serve.remote())
+        if self.trainer is not None:
+            self.actor.follow.remote(self.trainer)
+        if self.together:
+            self.actor.lock_step.remote(self.together)
+
 
 class RayEngine(Engine):
     """The asynchronous engine of a run whose ``policy.path`` is set; starts Ray if it is not there.
@@ -71,6 +77,7 @@ class RayEngine(Engine):
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to resume from, without the episodes under way; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
+        learns: False: only planned episodes are played, and no process learns.
     """
 
     def __init__(
@@ -80,13 +87,16 @@ class RayEngine(Engine):
         history: int = 1,
         state: Path | None = None,
         load: Load | None = None,
+        learns: bool = True,
     ) -> None:
         self._config = config
+        self._learns = learns
         self._limit = config.launch.stall_s
         self._version = 0 if state is None else saved_version(state)
         self._rollouts: list[RolloutSlot] = []
         self._inference: list[InferenceReplica] = []
         self._others: list[Worker] = []
+        self._trainer: Any = None  # a `Worker`, if it learns
         self._world_learner: Worker | None = None  # trains the world model of imagined environments
         self._world_version = 0  # of the models that the rollout workers were given last
         self._updates: list[dict[str, float]] = []
@@ -161,7 +171,7 @@ class RayEngine(Engine):
         self._check_moving(progress)
         return progress
 
-    def save(self, directory: Path) -> Saved:
+    def save(self, directory: Path) -> Progress:
         directory = directory.absolute()
         state = directory / TRAINING_STATE
         # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
@@ -176,7 +186,7 @@ class RayEngine(Engine):
         self._last_change = time.monotonic()
         updates = self._updates + records
         self._updates = []
-        return Saved(version, updates)
+        return Progress(version=version, updates=updates)
 
     def close(self) -> None:
         if self._closed:
@@ -204,15 +214,11 @@ class RayEngine(Engine):
         from accerl_lerobot.inference.worker import InferenceWorker
         from accerl_lerobot.replay.worker import ReplayWorker
         from accerl_lerobot.rollout.worker import RolloutWorker
-        from accerl_lerobot.trainer.worker import SHARE, LearnerSettings, TrainerRank, TrainerWorker
-        from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
 
         config = self._config
-        timeline = self._config.timeline_folder
+        timeline = config.timeline_folder
         in_cluster = config.launch.address is not None
         placement = place_workers(config)
-        for row in placement.rows():
-            logger.info("%s", row)
 
         def actor(role: str, kind: type, concurrency: int, *arguments: Any, **options: Any) -> Any:
             options |= placement.options(role) | {"max_concurrency": concurrency}
@@ -224,6 +230,28 @@ class RayEngine(Engine):
 
         stores = (config.replay, config.seed, state, config.folder, timeline, in_cluster)
         self._replay = add("replay", "replay", ReplayWorker, 1000, *stores)
+        replicas = numbered("inference", config.inference.workers)
+        if self._learns:
+            self._trainer = self._place_trainer(add, replicas, state, load)
+        for name in replicas:
+            deciding = (config.policy, config.inference, self._version, state, load, timeline, name)
+            handle = actor("inference", InferenceWorker, 1000, *deciding, in_cluster, **RESTARTED)
+            self._inference.append(InferenceReplica(name, handle, config.launch))
+        for index in range(config.rollout.workers):
+            name = f"rollout {index}"
+            collecting = (config.env, config.rollout, name, history, timeline, config.imagination)
+            handle = actor("rollout", RolloutWorker, 4, *collecting, **RESTARTED, **NO_HUB_TOKEN)
+            self._rollouts.append(RolloutSlot(index, handle, config, tasks))
+
+    def _place_trainer(
+        self, add: Callable[..., Worker], replicas: list[str], state: Path | None, load: Load | None
+    ) -> Worker:
+        """Create the trainer and the workers that learn with it; `add` makes one of them."""
+        from accerl_lerobot.trainer.worker import SHARE, LearnerSettings, TrainerRank, TrainerWorker
+        from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
+
+        config = self._config
+        timeline = config.timeline_folder
         # The ranks before others with a network: Ray fills the GPU that is fullest, and each rank needs more
         # than half of one.
         settings = LearnerSettings(
@@ -244,18 +272,8 @@ class RayEngine(Engine):
                 WORLD_LEARNING, "world_model", OnlineLearningWorker, 4, config, state, timeline
             )
             online = self._world_learner.actor
-        replicas = numbered("inference", config.inference.workers)
         training = (settings, timeline, ranks, world_model, replicas, online)
-        self._trainer = add("trainer", "trainer", TrainerWorker, 4 + len(replicas), *training)
-        for name in replicas:
-            deciding = (config.policy, config.inference, self._version, state, load, timeline, name)
-            handle = actor("inference", InferenceWorker, 1000, *deciding, in_cluster, **RESTARTED)
-            self._inference.append(InferenceReplica(name, handle, config.launch))
-        for index in range(config.rollout.workers):
-            name = f"rollout {index}"
-            collecting = (config.env, config.rollout, name, history, timeline, config.imagination)
-            handle = actor("rollout", RolloutWorker, 4, *collecting, **RESTARTED, **NO_HUB_TOKEN)
-            self._rollouts.append(RolloutSlot(index, handle, config, tasks))
+        return add("trainer", "trainer", TrainerWorker, 4 + len(replicas), *training)
 
     def _await_start(self) -> None:
         """Wait until all workers are ready, and have them begin."""
@@ -268,20 +286,7 @@ class RayEngine(Engine):
             replica = self._inference[slot.index % len(self._inference)]
             slot.services = (replica.endpoint, self._replay.endpoint)
         for worker in (*self._inference, *self._rollouts):
-            self._begin(worker)
-
-    def _begin(self, worker: RestartedWorker) -> None:
-        """Start the long call of a process that is ready."""
-        if isinstance(worker, RolloutSlot):
-            if worker.world is not None:
-                worker.actor.imagine_with.remote(worker.world)
-            worker.begin(worker.actor.run.remote(*worker.services))
-        elif isinstance(worker, InferenceReplica):
-            worker.begin(worker.actor.serve.remote())
-            if worker.trainer is not None:
-                worker.actor.follow.remote(worker.trainer)
-            if worker.together:
-                worker.actor.lock_step.remote(worker.together)
+            worker.begin()
 
     def _ask(self) -> None:
         """Ask each worker that has answered for the next report."""
@@ -369,13 +374,12 @@ class RayEngine(Engine):
 
     def _supervise(self) -> None:
         """Give up workers that hang, and go on with those that are being restarted."""
-        show_new_warnings(list(self._everyone()))
         # Inference last: workers that wait for it are silent too.
         for worker in (*self._others, *self._rollouts, *self._inference):
             if isinstance(worker, RestartedWorker) and worker.is_starting:
                 self._last_change = time.monotonic()  # a restart has a timeout of its own
                 if worker.advance_start():
-                    self._begin(worker)
+                    worker.begin()
             elif why := worker.hung():
                 worker.lost(WorkerError(f"{worker.name} worker {why}"))
 
@@ -390,6 +394,5 @@ class RayEngine(Engine):
             self._last_state = state
             self._last_change = now
         elif now - self._last_change > 2 * self._limit:  # a single worker that hangs is found earlier
-            counters = f"{progress.rollout}, {progress.replay}"
             hint = "raise launch.stall_s if a single step takes that long"
-            raise WorkerError(f"nothing moved for {2 * self._limit:.0f} s: {counters}; {hint}")
+            raise WorkerError(f"nothing moved for {2 * self._limit:.0f} s; {hint}")

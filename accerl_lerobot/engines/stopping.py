@@ -15,11 +15,6 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 class WorkerError(RuntimeError):
     """A worker is lost for good, and the engine with it; another engine can resume from a checkpoint."""
 
-    @property
-    def brief(self) -> bool:
-        """True if it has no traceback of a worker."""
-        return "\n" not in str(self)
-
 
 class StoppedError(Exception):
     """A run was asked to stop, and can be resumed."""

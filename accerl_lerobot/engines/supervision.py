@@ -12,6 +12,7 @@ import contextlib
 import logging
 import math
 import time
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -58,8 +59,7 @@ class Worker:
         self.pid = 0  # of its process, once that is ready
         self.work: Any = None  # reference of the long call
         self.last_answer: Any = None
-        self.warnings: list[Any] = []  # references of what its process has warned of
-        self._question: Any = None
+        self._question: list[Any] = []  # references of the answer, and of what its process has warned of
         self._asked = 0.0
 
     def ready_arguments(self) -> tuple[Any, ...]:
@@ -68,28 +68,34 @@ class Worker:
 
     def ask(self, method: str, *arguments: Any) -> bool:
         """Ask unless an answer is outstanding; returns True if it did."""
-        if self._question is not None:
+        if self._question:
             return False
-        self._question = getattr(self.actor, method).remote(*arguments)
+        answer = getattr(self.actor, method).remote(*arguments)
+        self._question = [answer, self.ask_warnings()]
         self._asked = time.monotonic()
-        self.ask_warnings()
         return True
 
-    def ask_warnings(self) -> None:
-        self.warnings.append(self.actor.__ray_call__.remote(collected_warnings))
+    def ask_warnings(self) -> Any:
+        """Reference of what its process has warned of since it was asked last."""
+        return self.actor.__ray_call__.remote(collected_warnings)
 
     def answer(self, timeout: float = 0.0) -> Any:
-        """The answer to the last question; None if it has not come, or has been taken."""
-        if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
-            return None
+        """The answer to the last question; None if it has not come, or has been taken. Shows new warnings."""
         question = self._question
-        self._question = None
-        self.last_answer = ray.get(question)
+        if not question or not self._is_answered(timeout):
+            return None
+        self._question = []
+        self.last_answer, warnings = ray.get(question)
+        show_warnings(warnings)
         return self.last_answer
+
+    def _is_answered(self, timeout: float = 0.0) -> bool:
+        ready, _ = ray.wait(self._question, num_returns=len(self._question), timeout=timeout)
+        return len(ready) == len(self._question)
 
     def hung(self) -> str:
         """The reason to give the worker up; empty if there is none."""
-        if self._question is None or ray.wait([self._question], timeout=0)[0]:
+        if not self._question or self._is_answered():
             return ""
         silent = time.monotonic() - self._asked
         return f"has not answered for {silent:.0f} s" if silent > self._launch.stall_s else ""
@@ -131,8 +137,12 @@ class RestartedWorker(Worker):
     def is_starting(self) -> bool:
         return self._starting is not None
 
-    def begin(self, reference: Any) -> None:
-        """Note the long call of a process that is ready."""
+    @abstractmethod
+    def begin(self) -> None:
+        """Start the long call of a process that is ready."""
+
+    def started(self, reference: Any) -> None:
+        """Note the long call of a process."""
         self.work = reference
         self._since = time.monotonic()
 
@@ -153,7 +163,8 @@ class RestartedWorker(Worker):
         logger.warning("%s worker is restarted %s: %s", self.name, number, reason)
         if not has_died(error):
             ray.kill(self.actor, no_restart=False)
-        self.work = self._question = self.last_answer = None
+        self.work = self.last_answer = None
+        self._question = []
         self._since = math.inf
         self._asked = time.monotonic()
         self._ask_ready()
@@ -229,6 +240,11 @@ class RolloutSlot(RestartedWorker):
         plans = EpisodePlans(self._tasks, self._seed, self.budget, self.index, self.incarnation)
         return plans, self.begun
 
+    def begin(self) -> None:
+        if self.world is not None:
+            self.actor.imagine_with.remote(self.world)
+        self.started(self.actor.run.remote(*self.services))
+
     def take(self, report: Report) -> list[EpisodeResult]:
         """Note a report; the episodes in it."""
         results = []
@@ -295,9 +311,6 @@ def save_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
 def restore_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     """Go on from what `save_rollouts` has written."""
     saved = snapshot.load(directory / ROLLOUT)
-    if len(saved["slots"]) != len(workers):
-        hint = f"this run has {len(saved['slots'])}; leave the field out"
-        raise InputError("rollout.workers", len(workers), hint)
     workers[0].past = Counter(saved["past"])
     for worker, slot in zip(workers, saved["slots"], strict=True):
         worker.incarnation = slot["incarnation"] + 1
@@ -314,24 +327,14 @@ def total_counters(workers: Iterable[RolloutSlot]) -> Counter[str]:
     return total
 
 
-def show_new_warnings(workers: Sequence[Worker], timeout: float = 0.0) -> None:
-    """Show each warning that workers have handed over, once."""
-    asked = [reference for worker in workers for reference in worker.warnings]
-    if not asked:
-        return
-    ready, waiting = ray.wait(asked, num_returns=len(asked), timeout=timeout)
-    for reference in ready:
-        with contextlib.suppress(RayError):  # the process has died, which others find out
-            show_warnings(ray.get(reference))
-    for worker in workers:
-        worker.warnings = [reference for reference in worker.warnings if reference in waiting]
-
-
 def end_all(workers: Sequence[Worker]) -> None:
     """End workers, show their last warnings, and wait until their processes write nothing any more."""
-    for worker in workers:
-        worker.ask_warnings()
-    show_new_warnings(workers, LAST_WARNINGS_S)
+    asked = [worker.ask_warnings() for worker in workers]
+    if asked:
+        ready, _ = ray.wait(asked, num_returns=len(asked), timeout=LAST_WARNINGS_S)
+        for reference in ready:
+            with contextlib.suppress(RayError):  # the process has died
+                show_warnings(ray.get(reference))
     for worker in workers:
         ray.kill(worker.actor)
     deadline = time.monotonic() + GONE_S

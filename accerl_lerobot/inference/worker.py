@@ -4,7 +4,7 @@
 consumes    requests for decisions, and the newest weights that the trainer has published
 produces    decisions, each stamped with the version of its weights
 waits for   a full batch, or until its oldest request has waited `max_wait_s`
-ends        with the run; an exception fails all requests, and Ray restarts the process, whose only state is
+ends        with the run; an exception ends all connections, and Ray restarts the process, whose only state is
             weights
 
 Weights are swapped in between batches, so no batch sees two versions. One thread waits for clients and for
@@ -131,7 +131,6 @@ class InferenceWorker:
             await asyncio.to_thread(self._serve)
         finally:
             self._over = True
-            self._iteration = None
             self._server.wake()
 
     async def metrics(self) -> Metrics:
@@ -147,7 +146,6 @@ class InferenceWorker:
         return self._batcher.counts | {"version": float(self._version), "busy_share": share}
 
     def _serve(self) -> None:
-        batch: list[PendingRequest] = []
         try:
             while not self._over:
                 self._iteration = time.monotonic()
@@ -161,18 +159,10 @@ class InferenceWorker:
                     self._batcher.lock_step(self._lock_step.popleft())
                 self._swap()
                 if self._batcher.due(time.monotonic()):
-                    batch = self._batcher.take(time.monotonic())
-                    self._serve_batch(batch)
-                    batch = []
-        except BaseException as error:
+                    self._serve_batch(self._batcher.take(time.monotonic()))
+        finally:
             self._iteration = None
-            self._server.poll(0.0)
-            while len(self._batcher):
-                batch += self._batcher.take(time.monotonic())
-            for request in batch:
-                request.fail(error)
-            self._server.close()
-            raise
+            self._server.close()  # clients learn at once that their requests will not be answered
 
     def _add(self, request: PendingRequest) -> None:
         self._batcher.add(request, request.sent)

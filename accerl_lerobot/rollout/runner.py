@@ -435,6 +435,8 @@ class RolloutRunner:
             self.counters.episodes += 1
         else:
             self.counters.imagined_episodes += 1
+        if note:
+            warn_once(note)
         versions = episode.versions or [0]
         result = EpisodeResult(
             plan=episode.plan,

@@ -21,12 +21,11 @@ in the run, it has a process too: `world_model.worker` for the state of critic a
 
 from __future__ import annotations
 
-import logging
 import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +42,6 @@ from accerl_lerobot.experience import IMAGINED
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
-
-logger = logging.getLogger(__name__)
 
 FILMED = ".before"  # name of the filmed episodes of the first evaluation, kept until the video is made
 RECORD_EVERY = 10  # updates between two records of the workers' counters when no episode ends
@@ -68,7 +65,6 @@ def run_plans(
     with console.stage(f"evaluation ({group})", total=count) as stage:
         while len(results) < count:
             progress = engine.poll()
-            _warn_of_notes(progress.episodes)
             results += [episode for episode in progress.episodes if episode.plan.group == group]
             on_progress(progress)
             successes = [result.success for result in results]
@@ -76,39 +72,14 @@ def run_plans(
     return sorted(results, key=lambda result: result.plan.index)
 
 
-def _warn_of_notes(episodes: list[EpisodeResult]) -> None:
-    for episode in episodes:
-        if episode.note:
-            warn_once(episode.note)
-
-
 @dataclass(kw_only=True)
 class Times:
-    """Seconds of a run; `started` is when this process began, on `time.monotonic`."""
+    """Seconds of a run. Those since its workers began to start are in `MetricsLog`."""
 
-    started: float
-    warm_s: float = 0.0  # warm start
-    rl_s: float = 0.0  # training, before `training_since`
-    training_since: float | None = None
-    before_s: float | None = 0.0  # all, in earlier processes; None: the checkpoint has it
+    warm_s: float = 0.0  # before the workers began to start
+    rl_s: float = 0.0  # training
     furthest: int = 0  # latest update made in this process, lost or not
     clock: Clock = field(default_factory=NoClock)  # the driver's row of the timeline
-
-    def state(self) -> dict[str, float]:
-        """Seconds until now, as a checkpoint holds them."""
-        now = time.monotonic()
-        wall_s = (self.before_s or 0.0) + now - self.started
-        rl_s = self.rl_s
-        if self.training_since is not None:
-            rl_s += now - self.training_since
-        return {"rl_s": rl_s, "wall_s": wall_s, "warm_s": self.warm_s}
-
-    def restore(self, state: dict[str, float]) -> None:
-        self.rl_s = state["rl_s"]
-        self.warm_s = state["warm_s"]
-        self.training_since = None
-        if self.before_s is None:
-            self.before_s = state["wall_s"]
 
 
 @dataclass(kw_only=True)
@@ -148,7 +119,6 @@ class Recorder:
         state = self.state
         self.times.clock.beat()
         self.record_updates(progress.updates)
-        _warn_of_notes(progress.episodes)
         explored: list[EpisodeResult] = []
         for episode in progress.episodes:
             if episode.plan.source == IMAGINED:
@@ -158,7 +128,11 @@ class Recorder:
                 explored.append(episode)
         del state.imagined[:-RECENT]
         del state.recent[:-RECENT]
-        self._count(explored)
+        for episode in explored:
+            state.explored += 1
+            state.won += episode.success
+            state.note = episode.note or state.note
+        self.warn_if_hopeless(HOPELESS)
         # The first episodes to end are the short ones, which are successes.
         training = math.isinf(state.steps)
         if explored and training and len(state.recent) >= RECENT // 4:
@@ -213,26 +187,13 @@ class Recorder:
         decisions = self.since(progress, "decisions")
         return f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
 
-    def warn_if_hopeless(self) -> None:
-        """Warn if there were exploring episodes and none has succeeded."""
-        state = self.state
-        if state.explored and not state.won:
-            note = f" ({state.note})" if state.note else ""
-            logger.warning(
-                "none of %d exploring episodes succeeded%s; where success is the only reward there is "
-                "nothing to learn from: see env.success, and docs/troubleshooting.md",
-                state.explored, note,
-            )  # fmt: skip
-
-    def _count(self, explored: list[EpisodeResult]) -> None:
-        state = self.state
-        before = state.explored
-        state.explored += len(explored)
-        for episode in explored:
-            state.won += episode.success
-            state.note = episode.note or state.note
-        if before < HOPELESS <= state.explored:
-            self.warn_if_hopeless()
+    def warn_if_hopeless(self, least: int = 1) -> None:
+        """Warn once if there were so many exploring episodes and none has succeeded."""
+        if self.state.explored >= least and not self.state.won:
+            warn_once(
+                "none of the exploring episodes has succeeded; where success is the only reward there is "
+                "nothing to learn from: see env.success, and docs/troubleshooting.md"
+            )
 
     def _log_counters(self, progress: Progress, explored: list[EpisodeResult]) -> None:
         state = self.state
@@ -284,8 +245,7 @@ class Loop:
         filmed = self._begin() if state is None else self._resume(state)
         progress = self._train()
         self._save()
-        if self.state.explored < HOPELESS:
-            self.recorder.warn_if_hopeless()
+        self.recorder.warn_if_hopeless()
         after, results = self._evaluate("after", self.state.steps)
         summary: dict[str, Any] = plain(self._summary(after, progress))
         layout.write_json(self.directory / layout.SUMMARY, summary)
@@ -311,10 +271,10 @@ class Loop:
         version = layout.saved_version(folder)
         self._began_at = folder.parent.name
         saved = snapshot.load(folder / layout.RUN_STATE)
-        for each in fields(RunState):
-            setattr(state, each.name, saved[each.name])
+        vars(state).update({name: saved[name] for name in vars(state)})
         self.recorder.log.restore(saved["log"], version)
-        self.times.restore(saved["times"])
+        self.times.rl_s = saved["times"]["rl_s"]
+        self.times.warm_s = saved["times"]["warm_s"]
         if version < self.config.trainer.updates:  # more are asked for than were when it ended
             state.steps = math.inf
         evaluations = _multiples(version, self.config.evaluation.every_updates)
@@ -332,10 +292,12 @@ class Loop:
         times = self.times
         self.engine.train()
         times.clock.enter(TRAINING)
-        times.training_since = self._saved_at = time.monotonic()
+        self._saved_at = time.monotonic()
+        began = self.recorder.log.wall_s - times.rl_s
         with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
             while True:
                 progress = self.engine.poll()
+                times.rl_s = self.recorder.log.wall_s - began
                 self.recorder.record(progress)
                 stage.update(progress.version, self.recorder.status(progress))
                 if progress.done:
@@ -346,8 +308,6 @@ class Loop:
                 if self._save_is_due(progress) or self.stop.asked is not None:
                     self._save()
                 self.stop.check()
-        times.rl_s = times.state()["rl_s"]
-        times.training_since = None
         self.state.steps = self.recorder.env_steps(progress)
         return progress
 
@@ -396,7 +356,8 @@ class Loop:
         self.state.saved = _multiples(saved.version, self.config.save_every_updates)
         shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
         log = self.recorder.log.state()
-        state = vars(self.state) | {"log": log, "times": self.times.state()}
+        times = {"rl_s": self.times.rl_s, "warm_s": self.times.warm_s}
+        state = vars(self.state) | {"log": log, "times": times}
         snapshot.save(folder / layout.TRAINING_STATE / layout.RUN_STATE, state)
         return saved.version
 
@@ -411,7 +372,6 @@ class Loop:
 
     def _summary(self, after: dict[str, Any], last: Progress) -> dict[str, Any]:
         state = self.state
-        times = self.times.state()
         before = state.before or {}
         return {
             **{f"{name}_before": before.get(name) for name in RATE},
@@ -425,9 +385,9 @@ class Loop:
             "lag_mean": _mean(state.lags or [0.0]),
             "lag_max": state.lag_max,
             "ratio_max_dev": state.mismatch_max,
-            "wall_s": times["wall_s"],
-            "warm_start_s": times["warm_s"],
-            "rl_s": times["rl_s"],
+            "wall_s": self.times.warm_s + self.recorder.log.wall_s,
+            "warm_start_s": self.times.warm_s,
+            "rl_s": self.times.rl_s,
             "episodes_explored": state.explored,
             "note": state.note,
             "algorithm": self.config.algorithm.type,

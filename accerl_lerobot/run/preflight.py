@@ -28,7 +28,7 @@ from accerl_lerobot.envs import (
     environment_error,
     make_environment,
 )
-from accerl_lerobot.errors import InputError, causes, check_absent, expanded
+from accerl_lerobot.errors import InputError, causes
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.features import (
     ACTION,
@@ -83,13 +83,12 @@ def check_environment(env: EnvConfig, reward_model: RewardModelConfig | None = N
 
 def _compare_starts(first: Observation, other: Observation, again: Observation) -> None:
     """Warn if starts do not follow from their seeds: `again` has the seed of `first`, `other` another."""
-    arrays = [key for key, value in first.items() if not isinstance(value, str)]
-    if not all(_same(first[key], again[key]) for key in arrays):
+    if not _same(first, again):
         logger.warning(
             "the environment's reset ignores its seed: the same seed gives different first observations. No "
             "episode can be repeated, and success before and after training is measured on different starts"
         )
-    elif all(np.array_equal(first[key], other[key]) for key in arrays):
+    elif _same(first, other, noise=0):
         logger.warning(
             "all episodes have the same start: the first observations of different seeds are equal. An "
             "evaluation of any number of episodes measures one start (n=1); see if an option of the "
@@ -97,10 +96,15 @@ def _compare_starts(first: Observation, other: Observation, again: Observation) 
         )
 
 
-def _same(one: Any, two: Any) -> bool:
-    """True if two arrays of an observation are equal but for rounding and noise of rendering."""
-    slack = VISIBLE if one.dtype == np.uint8 else 1e-5
-    return one.shape == two.shape and np.allclose(one.astype(float), two, rtol=1e-4, atol=slack)
+def _same(one: Observation, two: Observation, noise: int = VISIBLE) -> bool:
+    """True if two observations are equal but for rounding and so many levels of a pixel."""
+    for name, array in one.items():
+        if isinstance(array, str):
+            continue
+        slack = noise if array.dtype == np.uint8 else 1e-5
+        if not np.allclose(array.astype(float), two[name], rtol=1e-4, atol=slack):
+            return False
+    return True
 
 
 def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False) -> int:
@@ -138,12 +142,9 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> Enviro
     Returns:
         The spec of the environment.
     """
-    from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.config import check_likelihood, sampler_config
 
     algorithm = config.algorithm
-    if config.output_dir is not None and not config.resume:
-        check_absent(expanded(config.output_dir, "output_dir"))
     if config.policy.path is None and not config.sft.steps:
         hint = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, hint)
@@ -162,18 +163,14 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> Enviro
         field = "sft.policy.type" if new else "policy.type"
         check_likelihood(algorithm.type, sampler_config(config.policy, policy.type), policy.type, field)
     spec = check_environment(config.env, config.rollout.reward_model)
-    meta = None
     if config.policy.path is None:
-        trained = policy if config.sft.init_path is None else sft_policy(config.sft)
-        meta = check_training_data(config.sft, config.dataset, trained, spec, config.policy.rename_map)
+        check_training_data(config.sft, config.dataset, policy, spec, config.policy.rename_map)
     else:
         _check_reads(policy, config.policy, spec)
     if isinstance(algorithm, OffPolicyConfig):
         check_off_policy(config, policy, spec)
-        if meta is None and config.dataset.repo_id is not None:
-            meta = open_metadata(config.dataset)
-        if meta is not None:
-            _check_remembered(config, spec, meta, int(policy.n_obs_steps))
+        if config.dataset.repo_id is not None:
+            _check_remembered(config, spec, int(policy.n_obs_steps))
     return spec
 
 
@@ -206,12 +203,13 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
         raise InputError("world_model.type", model.type, hint)
 
 
-def _check_remembered(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> None:
+def _check_remembered(config: RunConfig, spec: EnvironmentSpec, history: int) -> None:
     """Compare a dataset that joins the memory with the environment, or warn that it does not join."""
-    from accerl_lerobot.demos.dataset_files import numbers, opened, read_labels
+    from accerl_lerobot.demos.dataset_files import numbers, open_metadata, opened, read_labels
     from accerl_lerobot.run.adapter import unlike
 
     dataset = config.dataset
+    meta = open_metadata(dataset)
     about = ("dataset.repo_id", dataset.repo_id)
     shapes: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
     if config.env.state_size:
@@ -234,39 +232,40 @@ def check_training_data(
     policy: Any,
     spec: EnvironmentSpec | None,
     rename_map: dict[str, str],
-) -> Any:
-    """Compare dataset, policy and environment of an SFT; returns the dataset's metadata, if there is one."""
+) -> None:
+    """Compare policy and environment of an SFT with the dataset, or with what the environment records."""
     from accerl_lerobot.demos.dataset_files import numbers, open_metadata, opened
     from accerl_lerobot.demos.sft import picked
 
-    meta = None if dataset.repo_id is None else open_metadata(dataset)
+    if any("rename_map" in argument for argument in sft.extra_args):
+        return  # with names of its own, LeRobot compares dataset and policy
     offered = None if spec is None else env_features(spec)
+    source = offered
     about: tuple[str, Any] = "dataset.repo_id", dataset.repo_id
-    data = None if meta is None else replace(dataset_features(meta), any_size=resizes(policy))
-    source = data or offered  # without a dataset, demonstrations of the environment
-    if source is None or any("rename_map" in argument for argument in sft.extra_args):
-        return meta  # with names of its own, LeRobot compares dataset and policy
+    if dataset.repo_id is not None:
+        meta = open_metadata(dataset)
+        source = replace(dataset_features(meta), any_size=resizes(policy))
+    assert source is not None  # a run has an environment, and SFT alone a dataset
     if sft.init_path is None:
         needs = _new_policy_features(policy, source, about)
-        if offered is not None:
-            hint = "; or name fewer in sft.policy.input_features"
-            check_features(needs, offered, rename_map, *about, hint=hint)
+        start = about
+        hint = "; or name fewer in sft.policy.input_features"
     else:
         needs = fine_tuned_features(policy, source)
         start = ("sft.init_path", sft.init_path)
-        if data is not None:
-            check_features(replace(needs, tasks=()), data, {}, *start, "dataset")
-        if offered is not None:
-            check_features(needs, offered, rename_map, *start)
-        if offered is not None and data is not None:
-            # Its cameras may have names of their own.
-            vectors = {name: shape for name, shape in data.shapes.items() if name in (STATE, ACTION)}
-            check_features(replace(data, shapes=vectors), offered, {}, *about)
+        hint = ""
+        if source is not offered:
+            check_features(replace(needs, tasks=()), source, {}, *start, "dataset")
+            if offered is not None:
+                # Its cameras may have names of their own.
+                vectors = {name: shape for name, shape in source.shapes.items() if name in (STATE, ACTION)}
+                check_features(replace(source, shapes=vectors), offered, {}, *about)
+    if offered is not None:
+        check_features(needs, offered, rename_map, *start, hint=hint)
     _check_padding(policy, needs, sft)
-    if meta is not None and spec is not None:
+    if spec is not None and source is not offered:
         with opened(dataset, meta, picked(dataset, sft.pick)) as read:
             check_actions(numbers(read, ACTION, dataset), spec, *about)
-    return meta
 
 
 def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) -> Features:
@@ -368,13 +367,8 @@ def check_sft_policy(config: SFTConfig) -> Any:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
-        chain: list[Any] = list(causes(error))
-        hint = f"LeRobot says: {chain[-1]}"
-        for link in chain:
-            if getattr(link, "key_path", ()):
-                name = link.key_path[0]
-                raise InputError(f"sft.policy.{name}", fields.get(name), hint) from error
-        raise InputError("sft.policy", fields, hint) from error
+        *_, reason = causes(error)
+        raise InputError("sft.policy", fields, f"LeRobot says: {error} {reason}") from error
 
 
 def sft_policy(config: SFTConfig) -> Any:

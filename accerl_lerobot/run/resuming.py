@@ -16,7 +16,6 @@ from typing import Any
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
-from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, decode, encode
 from accerl_lerobot.errors import InputError
@@ -25,21 +24,19 @@ from accerl_lerobot.replay.journal import EPISODES
 
 LOCK = ".lock"
 CHANGEABLE = (
-    "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
-    "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
-    "trainer.activation_checkpointing", "inference", "imagination.discover_packages_path", "env.assets",
+    "resume", "output_dir", "evaluation", "launch.address", "launch.placement", "launch.schedule",
+    "launch.stall_s", "launch.max_restarts", "wandb", "save_every_updates", "save_every_s", "trainer.updates",
+    "trainer.num_threads", "trainer.ranks", "trainer.sharding", "trainer.activation_checkpointing",
+    "inference", "imagination.discover_packages_path", "env.assets",
 )  # fmt: skip
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 WARM_START = "warm_start.json"
 """File with the path of the policy that came of a run's own demonstrations and SFT."""
 
 
-def warm_started(directory: Path) -> Path | None:
-    """The policy that came of a run's own demonstrations and SFT; None: there is none yet."""
-    note = directory / WARM_START
-    if not note.is_file():
-        return None
-    content = json.loads(note.read_text())
+def warm_started(directory: Path) -> Path:
+    """The policy that came of a run's own demonstrations and SFT."""
+    content = json.loads((directory / WARM_START).read_text())
     return directory / str(content["policy"])
 
 
@@ -78,8 +75,7 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     summary = directory / layout.SUMMARY
     # From an earlier checkpoint there are updates left to make.
     if newest and summary.is_file():
-        made: Any = read_json(summary, source).get("updates")
-        check(Steps, made, f"{summary}: updates")
+        made = read_json(summary, source)["updates"]
         if made >= config.trainer.updates:
             hint = f"the run {directory} has made them, and has ended; ask for more"
             raise InputError("trainer.updates", config.trainer.updates, hint)
@@ -105,38 +101,12 @@ def newest_checkpoint(directory: Path, resume_from: str, console: Console) -> Pa
     return path
 
 
-def check_engine(engine: str, checkpoint: Path) -> None:
-    """Refuse a checkpoint of the other engine."""
-    from accerl_lerobot.engines.local import LOCAL  # imports torch
-
-    former = "ray"
-    if (checkpoint / layout.TRAINING_STATE / f"{LOCAL}.json").is_file():
-        former = "local"
-    if engine != former:
-        was = "in one process" if former == "local" else "asynchronous"
-        raise InputError(
-            "launch.engine", engine, f"this run was {was}; resume it with launch.engine={former}"
-        )
-
-
 def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
     """The run as one that goes on from a checkpoint."""
     if config.policy.tuning.mode != "lora":
         return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
-    path = config.policy.path or warm_started(directory)
-    if path is None or not _may_exist(str(path)):
-        hint = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
-        hint += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
-        raise InputError("policy.path", path, hint)
-    return improving(config, path)
-
-
-def _may_exist(path: str) -> bool:
-    """True for a folder, and for a name that a repository of the Hub can have."""
-    if Path(path).expanduser().is_dir():
-        return True
-    return path.count("/") <= 1 and not path.startswith((".", "/", "~"))
+    return improving(config, config.policy.path or warm_started(directory))
 
 
 def improving(config: RunConfig, path: Path | str) -> RunConfig:
@@ -158,16 +128,11 @@ def _check_unchanged(before: Any, now: Any, name: str = "") -> None:
 
 
 @contextmanager
-def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
-    """Keep other processes out of a folder, which is made if need be.
-
-    Gives a file descriptor to hand to child processes that are to keep it locked. If another process has
-    locked it, the error names `field`, and `in_use` as the hint.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
+def locked(directory: Path) -> Iterator[None]:
+    """Keep other processes out of a run's folder."""
     with (directory / LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise InputError(field, str(directory), in_use) from error
-        yield file.fileno()
+            raise InputError("config_path", str(directory), "another process resumes it") from error
+        yield

@@ -39,7 +39,7 @@ from accerl_lerobot.engines import Engine, ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, printable
+from accerl_lerobot.errors import InputError, check_absent, expanded, kept_traceback, printable
 from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
@@ -96,20 +96,27 @@ def start(
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
-    from accerl_lerobot.policies.loading import load_acting, pinned
+    from accerl_lerobot.policies.loading import load_acting
 
     with ray_session.opened(config.launch):
         check_device(config)
         spec = check_environment(config.env, config.rollout.reward_model)
-        config = replace(config, policy=pinned(config.policy))
         # Nothing is learnt, whatever the recipe says.
         config = replace(config, algorithm=GIPOConfig(), world_model=None, imagination=ImaginationConfig())
+        config = pinned(config)
         history = check_policy(config, spec)
-        engine = make_engine(config, spec.tasks, history, load=load_acting)
+        engine = make_engine(config, spec.tasks, history, load=load_acting, learns=False)
         with closing(engine):
             count = config.evaluation.episodes
             engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
             return run_plans(engine, count, "eval", console)
+
+
+def pinned(config: RunConfig) -> RunConfig:
+    """The config with the commit that a checkpoint on the Hub has now."""
+    from accerl_lerobot.policies import loading
+
+    return replace(config, policy=loading.pinned(config.policy))
 
 
 def _with_absolute_paths(config: RunConfig) -> RunConfig:
@@ -140,6 +147,7 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
+    learns: bool = True,
 ) -> Engine:
     """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
     config = _with_absolute_paths(config)
@@ -155,7 +163,7 @@ def make_engine(
     ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engines.ray_engine import RayEngine
 
-    return RayEngine(config, tasks, history, state, load)
+    return RayEngine(config, tasks, history, state, load, learns)
 
 
 def fine_tune(
@@ -183,8 +191,8 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     note = directory / resuming.WARM_START
     if config.policy.path is not None:
         return config
-    if (warm := resuming.warm_started(directory)) is not None:
-        return resuming.improving(config, warm)
+    if note.is_file():
+        return resuming.improving(config, resuming.warm_started(directory))
     for name in (f"{layout.DEMOS}.partial", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
@@ -223,18 +231,14 @@ class Run:
         self.console = console
         self.resume_from = resume_from
         self.load = load
-        self.times = Times(started=time.monotonic())
+        self.times = Times()
         self.how = resuming.resume_command(directory, config)
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
         guardian.explain(printable(f"to resume: {self.how}"))
         try:
-            with (
-                redirect_stdout(sys.stderr),
-                kept_traceback(self.directory),
-                resuming.locked(self.directory, "config_path", "another process resumes it"),
-            ):
+            with redirect_stdout(sys.stderr), kept_traceback(self.directory), resuming.locked(self.directory):
                 return self.execute()
         except InputError:
             if self.resume_from is None:
@@ -244,35 +248,15 @@ class Run:
             raise
         except BaseException as error:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-            if is_full(error):
-                reason = f"the disk of {self.directory} is full"
-            elif isinstance(error, WorkerError) and error.brief:
-                reason = str(error)
             self.console.say(f"{reason}; to resume: {self.how}")
             raise
         finally:
             guardian.explain("")
 
-    def begin(self) -> Path | None:
-        """Check the run and write its config; returns the checkpoint that it goes on from."""
-        checkpoint = None
-        if self.resume_from is None:
-            self.pin()
-            self.keep(self.config)  # first: the run can be resumed, whatever fails from here on
-            self.check()
-        else:
-            recipe = self.config
-            checkpoint = resuming.checkpoint_of(self.directory, self.resume_from, self.console)
-            if checkpoint is not None:
-                resuming.check_engine(recipe.launch.engine, checkpoint)
-                self.config = resuming.continued(recipe, self.directory, checkpoint)
-            self.check()
-            self.keep(recipe)  # only now: a resume that is refused leaves the run as it was
-        return checkpoint
-
     def execute(self) -> dict[str, Any]:
         """Do all phases; returns the summary, which is also in ``summary.json``."""
-        checkpoint = self.begin()
+        started = time.monotonic()
+        checkpoint = self.check()
         self.console.say(f"run {self.directory}")
         if checkpoint is None:
             self.config = warm_start(self.config, self.directory, self.console)
@@ -280,40 +264,41 @@ class Run:
             layout.go_back_to(checkpoint)
             (self.directory / layout.SUMMARY).unlink(missing_ok=True)  # of a later end, if it had ended
             self.console.say(f"going on from {checkpoint}")
-            self.times.before_s = None
         if self.config.imagination.environments and self.config.imagination.path is None:
             from accerl_lerobot.run.play import prepared
 
             self.config = prepared(self.config, self.directory, self.console, self.load)
-        self.times.warm_s = time.monotonic() - self.times.started
+        self.times.warm_s = time.monotonic() - started
         self.config = replace(self.config, output_dir=str(self.directory))
         return self.practise(checkpoint)
 
-    def pin(self) -> None:
-        """Name the commit that a checkpoint on the Hub has now."""
-        if self.load is None:
-            from accerl_lerobot.policies.loading import pinned
-
-            self.config = replace(self.config, policy=pinned(self.config.policy))
-
-    def keep(self, recipe: RunConfig) -> None:
-        """Write the run's config."""
-        text = yaml.safe_dump(encode(replace(recipe, resume=False)), sort_keys=False)
-        layout.write_atomically(self.directory / layout.CONFIG, text)
-
-    def check(self) -> None:
-        """Refuse a run that could not go well, before anything long."""
-        config = self.config
-        if self.load is None:
-            checked = replace(config, output_dir=None)  # the folder is there by now
-            self.spec = check_start(checked, self.console.say)
+    def check(self) -> Path | None:
+        """Refuse a run that could not go well, and write its config; the checkpoint that it goes on from."""
+        checkpoint = None
+        if self.resume_from is None:
+            if self.load is None:
+                self.config = pinned(self.config)
+            self._write_config(self.config)  # first: it can be resumed, whatever fails from here on
         else:
-            self.spec = check_environment(config.env)
-        check_placement(config)
-        if config.imagination.environments:
+            checkpoint = resuming.checkpoint_of(self.directory, self.resume_from, self.console)
+        recipe = self.config
+        if checkpoint is not None:
+            self.config = resuming.continued(recipe, self.directory, checkpoint)
+        if self.load is None:
+            self.spec = check_start(self.config, self.console.say)
+        else:
+            self.spec = check_environment(self.config.env)
+        check_placement(self.config)
+        if self.config.imagination.environments:
             from accerl_lerobot.world_model.imagined import check_imagination
 
-            check_imagination(config)
+            check_imagination(self.config)
+        self._write_config(recipe)  # only now: a resume that is refused leaves the run as it was
+        return checkpoint
+
+    def _write_config(self, recipe: RunConfig) -> None:
+        text = yaml.safe_dump(encode(replace(recipe, resume=False)), sort_keys=False)
+        layout.write_atomically(self.directory / layout.CONFIG, text)
 
     def practise(self, checkpoint: Path | None) -> dict[str, Any]:
         """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""

@@ -2,12 +2,11 @@
 """The timeline: every worker records its activity over time, and ``accerl timeline`` shows it.
 
 Entering a state ends the one before, so states exclude each other and their times add up to the time of the
-process by construction. Time is that of the monotonic clock; the calendar time at which a process began is
-noted too.
+process by construction.
 
-``RUN/timeline/rollout-0.1.bin`` is the second process (1) of ``rollout 0``: a line of JSON, then 8 bytes per
-entry, nanoseconds since the process began << 4 | state, little-endian. A killed process leaves at worst half
-an entry, which is not read. A process records its first two million entries.
+``RUN/timeline/rollout 0.1.bin`` is the second process (1) of ``rollout 0``. Each `ENTRY` has a time and the
+state that begins then. A killed process leaves at worst half an entry, which is not read. A process records
+its first 1.8 million entries.
 
 The result is a Chrome trace, which https://ui.perfetto.dev shows, and the shares of each role's time.
 """
@@ -15,12 +14,11 @@ The result is a Chrome trace, which https://ui.perfetto.dev shows, and the share
 from __future__ import annotations
 
 import json
-import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +41,19 @@ ROLES = (
 TIMELINE = "timeline"
 TRACE = "timeline.json"
 SUFFIX = ".bin"
-BITS = 4
+ENTRY = np.dtype([("ns", "<i8"), ("state", "u1")])
+"""Nanoseconds of the calendar, and a number in `STATES`."""
 FLUSH_NS = 1_000_000_000
 """An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
 MOST_BYTES = 16_000_000
+
+
+_MONOTONIC_BEGAN = time.time_ns() - time.monotonic_ns()
+
+
+def calendar_ns() -> int:
+    """Nanoseconds of the calendar, which never go back in this process."""
+    return _MONOTONIC_BEGAN + time.monotonic_ns()
 
 
 def role_of(worker: str) -> str:
@@ -61,29 +68,15 @@ class Clock:
     `worker` before a number is its role.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        worker: str,
-        *,
-        most_bytes: int = MOST_BYTES,
-        now: Callable[[], int] = time.monotonic_ns,
-        calendar: Callable[[], int] = time.time_ns,
-    ) -> None:
+    def __init__(self, folder: Path, worker: str, now: Callable[[], int] = calendar_ns) -> None:
         self._now = now
-        self._most_bytes = most_bytes
         self._lock = threading.Lock()
-        self._state = RECOVERY
-        self._began = now()
-        self._flushed = self._began
+        self._flushed = now()
         self._point = f"{role_of(worker).split()[-1]}.timeline"
         folder.mkdir(parents=True, exist_ok=True)
-        name = worker.replace(" ", "-")
-        earlier = len(list(folder.glob(f"{name}.*{SUFFIX}")))
-        self._file = (folder / f"{name}.{earlier}{SUFFIX}").open("xb")
-        head = {"worker": worker, "pid": os.getpid(), "wall_ns": calendar()}
-        self._file.write(json.dumps(head).encode() + b"\n")
-        self._file.flush()
+        earlier = len(list(folder.glob(f"{worker}.*{SUFFIX}")))
+        self._file = (folder / f"{worker}.{earlier}{SUFFIX}").open("xb")
+        self._note(RECOVERY, flush=True)
 
     def enter(self, state: int) -> None:
         """Ends the state before, unless it is the same."""
@@ -112,10 +105,10 @@ class Clock:
 
     def _note(self, state: int, *, flush: bool = False) -> None:
         self._state = state
-        if self._file.tell() >= self._most_bytes:
+        if self._file.tell() >= MOST_BYTES:
             return
         now = self._now()
-        self._file.write(((now - self._began) << BITS | state).to_bytes(8, "little"))
+        self._file.write(np.array((now, state), ENTRY).tobytes())
         if flush or now - self._flushed >= FLUSH_NS:
             fault_point(self._point)
             self._file.flush()  # from here on the entries survive this process
@@ -179,28 +172,20 @@ class Timeline:
         """From the beginning of the first worker to the end of the last."""
         return max(int(row.ends[-1]) for row in self.rows) / 1e9
 
-    def training(self) -> list[Window]:
-        """When the driver trained, checkpoints on the way included; all of the time if it never did."""
-        windows: list[Window] = []
+    def training(self) -> Window:
+        """From the begin of the driver's first training to the end of its last; all if it never trained."""
         for row in self.rows:
-            if row.role != "driver":
-                continue
-            follows = False  # an interval of training, or a checkpoint after it
-            for start, end, state in zip(row.starts / 1e9, row.ends / 1e9, row.states, strict=True):
-                if state == TRAINING:
-                    first = float(start)
-                    if follows:
-                        first, _ = windows.pop()
-                    windows.append((first, float(end)))
-                follows = state == TRAINING or (follows and state == CHECKPOINT)
-        return windows or [(0.0, self.seconds)]
+            times = np.flatnonzero(row.states == TRAINING)
+            if len(times):
+                return float(row.starts[times[0]]) / 1e9, float(row.ends[times[-1]]) / 1e9
+        return 0.0, self.seconds
 
-    def shares(self, windows: Sequence[Window] = ()) -> Shares:
-        """How the time of each role divides in `windows`, as far as it is kept; empty: in all of it."""
+    def shares(self, window: Window | None = None) -> Shares:
+        """How the time of each role divides in `window`, as far as it is kept; None: in all of it."""
         times: dict[str, np.ndarray] = {}
         for row in self.rows:
-            for window in windows or [(0.0, self.seconds)]:
-                times[row.role] = times.get(row.role, np.zeros(len(STATES))) + row.spent(window)
+            spent = row.spent(window or (0.0, self.seconds))
+            times[row.role] = times.get(row.role, 0.0) + spent
         shares: Shares = {}
         for role, spent in times.items():
             if spent.any():
@@ -216,52 +201,35 @@ def read_timeline(run_directory: Path) -> Timeline:
         InputError: there is none.
     """
     check_folder(run_directory, FileSource("runs", str(run_directory)))
-    processes: dict[str, list[Row]] = {}
-    for path in sorted((run_directory / TIMELINE).glob(f"*{SUFFIX}")):
-        row = _read_process(path)
-        if len(row.states):
-            processes.setdefault(row.worker, []).append(row)
+    processes: dict[str, list[np.ndarray]] = {}
+    for path in (run_directory / TIMELINE).glob(f"*{SUFFIX}"):
+        entries = np.fromfile(path, ENTRY)
+        if len(entries) > 1:
+            worker, _, _ = path.name.partition(".")
+            processes.setdefault(worker, []).append(entries)
     if not processes:
         hint = "no timeline in it: it is no run of accerl train, or no worker has begun"
         raise InputError("runs", str(run_directory), hint)
-    rows = sorted(map(_whole_row, processes.values()), key=_place)
-    began = min(int(row.starts[0]) for row in rows)
-    since_began = [replace(row, starts=row.starts - began, ends=row.ends - began) for row in rows]
-    return Timeline(run=run_directory, rows=tuple(since_began))
+    began = min(int(entries["ns"][0]) for all_entries in processes.values() for entries in all_entries)
+    rows = [_row(worker, all_entries, began) for worker, all_entries in processes.items()]
+    return Timeline(run=run_directory, rows=tuple(sorted(rows, key=_place)))
 
 
-def _read_process(path: Path) -> Row:
-    """The intervals of one process, by the nanoseconds of the calendar."""
-    head, _, data = path.read_bytes().partition(b"\n")
-    content = json.loads(head)
-    began = content["wall_ns"]
-    count = len(data) // 8  # a killed process leaves half an entry
-    entries = np.frombuffer(data, "<u8", count)
-    ends = (entries >> BITS).astype(np.int64) + began
-    starts = np.append(began, ends[:-1])[:count]
-    states = np.append(RECOVERY, entries % 2**BITS)[:count].astype(np.uint8)
-    return Row(worker=content["worker"], starts=starts, ends=ends, states=states)
-
-
-def _whole_row(processes: list[Row]) -> Row:
+def _row(worker: str, processes: list[np.ndarray], began: int) -> Row:
     """All intervals of a worker; one that was being ended when the next process began is cut there."""
-    starts = np.concatenate([row.starts for row in processes])
+    starts = np.concatenate([entries["ns"][:-1] for entries in processes]) - began
+    ends = np.concatenate([entries["ns"][1:] for entries in processes]) - began
+    states = np.concatenate([entries["state"][:-1] for entries in processes])
     order = np.argsort(starts, kind="stable")
     starts = starts[order]
-    ends = np.concatenate([row.ends for row in processes])[order]
-    states = np.concatenate([row.states for row in processes])[order]
     next_starts = np.append(starts[1:], ends.max())
-    ends = np.minimum(ends, next_starts)
-    return Row(worker=processes[0].worker, starts=starts, ends=ends, states=states)
+    return Row(worker=worker, starts=starts, ends=np.minimum(ends[order], next_starts), states=states[order])
 
 
-def _place(row: Row) -> tuple[int, str, int]:
+def _place(row: Row) -> tuple[int, int]:
     """Where the row stands: by role, then by number."""
     number = row.worker.removeprefix(row.role).strip()
-    place = len(ROLES)
-    if row.role in ROLES:
-        place = ROLES.index(row.role)
-    return place, row.role, int(number or 0)
+    return ROLES.index(row.role), int(number or 0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,6 @@ import contextlib
 import logging
 import os
 import pickle
-import queue
 import secrets
 import select
 import selectors
@@ -34,6 +33,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import AuthenticationError
 from multiprocessing.connection import Connection, answer_challenge, deliver_challenge
@@ -100,14 +100,10 @@ def _proved(
 def _notice_a_lost_machine(end: socket.socket) -> None:
     """Have a TCP connection fail within `SILENT_S` of the loss of the other machine, which says nothing."""
     end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in (
-        ("TCP_KEEPIDLE", SILENT_S // 2),
-        ("TCP_KEEPINTVL", SILENT_S // 6),
-        ("TCP_KEEPCNT", 3),
-        ("TCP_USER_TIMEOUT", 1000 * SILENT_S),
-    ):
-        if hasattr(socket, name):  # not on every system
-            end.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    if sys.platform == "linux":  # elsewhere there is one machine
+        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, SILENT_S // 2)
+        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, SILENT_S // 6)
+        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * SILENT_S)
 
 
 class Stream:
@@ -305,51 +301,44 @@ class ReconnectingClient:
     def send(self, message: Any) -> int:
         self._sent += 1
         self._unanswered[self._sent] = message
-        if self._client is None:
-            self._connect()
-        else:
-            self._send(self._sent)
+        with self._noticing_loss():
+            if self._client is None:
+                self._connect()
+            else:
+                self._client.send(message, self._sent)
         return self._sent
 
     def done(self, timeout: float) -> list[tuple[int, Any]]:
-        if self._client is None:
-            self._connect()
-        if self._client is None:
-            time.sleep(min(timeout, RETRY_S / 10))
-            return []
-        try:
+        with self._noticing_loss():
+            if self._client is None:
+                self._connect()
+            if self._client is None:
+                time.sleep(min(timeout, RETRY_S / 10))
+                return []
             replies = self._client.done(timeout)
-        except ServiceStoppedError as error:
-            self._lose(error)
-            return []
-        for ticket, _ in replies:
-            del self._unanswered[ticket]
-        return replies
+            for ticket, _ in replies:
+                del self._unanswered[ticket]
+            return replies
+        return []
 
     def _connect(self) -> None:
         """Connect where the service is now, unless that was tried a moment ago, and ask again."""
         if time.monotonic() < self._retry_at:
             return
+        self._client = self._endpoint.connect(RETRY_S)
+        for ticket, message in self._unanswered.items():
+            self._client.send(message, ticket)
+
+    @contextmanager
+    def _noticing_loss(self) -> Iterator[None]:
         try:
-            self._client = self._endpoint.connect(RETRY_S)
+            yield
         except ServiceStoppedError as error:
-            self._lose(error)
-        for ticket in self._unanswered:
-            self._send(ticket)
-
-    def _send(self, ticket: int) -> None:
-        if self._client is not None:
-            try:
-                self._client.send(self._unanswered[ticket], ticket)
-            except ServiceStoppedError as error:
-                self._lose(error)
-
-    def _lose(self, error: ServiceStoppedError) -> None:
-        logger.info("%s", error)
-        self._retry_at = time.monotonic() + RETRY_S
-        if self._client is not None:
-            self._client.close()
-            self._client = None
+            logger.info("%s", error)
+            self._retry_at = time.monotonic() + RETRY_S
+            if self._client is not None:
+                self._client.close()
+                self._client = None
 
 
 @dataclass(eq=False)
@@ -366,12 +355,9 @@ class PendingRequest:
         """True if the answer is not awaited any more."""
         return self.stream.closed
 
-    def answer(self, reply: Any) -> None:
-        self.server.reply(self, reply)
-
-    def fail(self, error: BaseException) -> None:
-        """Raise a `ServiceStoppedError` that names this error at the client."""
-        self.server.reply(self, str(stopped(error)), failed=True)
+    def answer(self, reply: Any, failed: bool = False) -> None:
+        """Answer, unless the client is gone; if `failed`, it raises a `ServiceStoppedError` of the reply."""
+        self.server.reply(self, reply, failed)
 
     def __len__(self) -> int:
         return len(self.message)
@@ -394,7 +380,7 @@ class Server:
         if not isinstance(at, str):
             at = self._listener.getsockname()
         self.address = Address(at, secrets.token_bytes(32))
-        self._accepted: queue.SimpleQueue[socket.socket] = queue.SimpleQueue()
+        self._accepted: deque[socket.socket] = deque()  # connections that `poll` is to take over
         self._woken, self._waker = socket.socketpair()
         self._woken.setblocking(False)
         self._waker.setblocking(False)
@@ -418,15 +404,15 @@ class Server:
         for key, events in self._selector.select(timeout):
             if key.fileobj is self._woken:
                 self._woken.recv(4096)
-                while not self._accepted.empty():
-                    self._selector.register(Stream(self._accepted.get()), selectors.EVENT_READ)
+                while self._accepted:
+                    self._selector.register(Stream(self._accepted.popleft()), selectors.EVENT_READ)
             else:
                 requests += self._exchange(key.fileobj, events)
         for request in sorted(requests, key=lambda request: request.sent):
             self._take(request)
 
-    def reply(self, request: PendingRequest, value: Any, failed: bool = False) -> None:
-        """Answer a request, unless its client is gone; see `PendingRequest`."""
+    def reply(self, request: PendingRequest, value: Any, failed: bool) -> None:
+        """See `PendingRequest.answer`."""
         stream = request.stream
         if stream.closed:
             return
@@ -460,15 +446,15 @@ class Server:
                 continue
             with contextlib.suppress(OSError, EOFError, AuthenticationError):
                 end = _proved(end, self.address.key, ACCEPT_S, deliver_challenge, answer_challenge)
-                self._accepted.put(end)
+                self._accepted.append(end)
                 self.wake()
         self._close_accepted()
 
     def _close_accepted(self) -> None:
         """Close connections that `poll` has not taken over."""
-        with contextlib.suppress(queue.Empty):
+        with contextlib.suppress(IndexError):
             while True:
-                self._accepted.get_nowait().close()
+                self._accepted.popleft().close()
 
     def _exchange(self, stream: Any, events: int) -> list[PendingRequest]:
         """Send a client what is left of replies, and read its messages."""
@@ -503,7 +489,7 @@ def serve_on_loop(answer: Callable[[Any], Awaitable[Any]], host: str | None = No
         try:
             request.answer(await answer(request.message))
         except Exception as error:
-            request.fail(error)
+            request.answer(str(stopped(error)), failed=True)
 
     def take(request: PendingRequest) -> None:
         task = asyncio.ensure_future(handle(request))

@@ -9,7 +9,7 @@ import pytest
 
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engines import Progress
+from accerl_lerobot.engines import Progress, local
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
@@ -55,6 +55,8 @@ def test_weights_held_back_act_so_many_updates_late_and_a_run_resumes(tiny_check
     left.save(tmp_path)
     after = drive(begin(4, tmp_path / TRAINING_STATE))
     assert updates(before + after) == updates(late)
+    with pytest.raises(InputError, match="not a state that accerl has saved"):  # it would lose its lag
+        local.LocalEngine(config, ("match",), state=tmp_path / TRAINING_STATE)
 
 
 def test_a_cell_holds_weights_back(tiny_checkpoint: Path, tmp_path: Path):

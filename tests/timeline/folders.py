@@ -10,27 +10,23 @@ import pytest
 from accerl_lerobot.timeline import TIMELINE, Clock, Row, Timeline
 
 SECOND = 10**9
-UP = 10**15  # the monotonic clock's time when a test begins; the calendar shows twice that
+BEGIN = 10**18  # time of the calendar when a test begins
 
 
 class Hands:
     """Hands of a clock, which stand still unless a test turns them."""
 
-    def __init__(self) -> None:
-        self.now = UP
+    def __init__(self, at_s: float) -> None:
+        self.now = BEGIN + round(at_s * SECOND)
 
     def __call__(self) -> int:
         return self.now
 
 
-def a_clock(
-    run: Path, worker: str = "trainer", *, at_s: float = 0.0, most_bytes: int = 10**6
-) -> tuple[Clock, Hands]:
+def a_clock(run: Path, worker: str = "trainer", *, at_s: float = 0.0) -> tuple[Clock, Hands]:
     """A worker's clock, whose process begins at a second of the calendar, and its hands."""
-    hands = Hands()
-    wall = 2 * UP + round(at_s * SECOND)
-    clock = Clock(run / TIMELINE, worker, most_bytes=most_bytes, now=hands, calendar=lambda: wall)
-    return clock, hands
+    hands = Hands(at_s)
+    return Clock(run / TIMELINE, worker, hands), hands
 
 
 def write_worker(run: Path, worker: str, spans: Iterable[tuple[int, float]], *, at_s: float = 0.0) -> None:

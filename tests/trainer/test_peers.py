@@ -3,7 +3,6 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -37,22 +36,14 @@ class LightRank:
         return self.steps
 
 
-@pytest.fixture
-def ranks_of(light_ray: None) -> Iterator[Callable[[int], list[Any]]]:
-    actors: list[Any] = []
-
-    def make(count: int) -> list[Any]:
-        actors.extend(ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(count))
-        ray.get([actor.made.remote() for actor in actors])
-        return actors
-
-    yield make
-    for actor in actors:
-        ray.kill(actor)
+def ranks(count: int) -> list[Any]:
+    actors = [ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(count)]
+    assert ray.get([actor.made.remote() for actor in actors]) == [0] * count
+    return actors
 
 
-def test_they_have_done_it_when_the_first_goes_on(ranks_of: Callable[[int], list[Any]]):
-    actors = ranks_of(2)
+def test_they_have_done_it_when_the_first_goes_on(light_ray: None):
+    actors = ranks(2)
     for _ in range(3):
         with Peers(actors, THREE, WAIT_S).joining("step", "fine"):
             pass
@@ -62,15 +53,14 @@ def test_they_have_done_it_when_the_first_goes_on(ranks_of: Callable[[int], list
 @pytest.mark.parametrize(
     ("how", "error"), [("fails", "the gradient fell over"), ("dies", "died"), ("hangs", "Get timed out")]
 )
-def test_a_rank_that_is_lost_ends_the_wait(ranks_of: Callable[[int], list[Any]], how: str, error: str):
-    peers = Peers(ranks_of(1), THREE, WAIT_S)
-    with pytest.raises(ray.exceptions.RayError, match=error), peers.joining("step", how):
+def test_a_rank_that_is_lost_ends_the_wait(light_ray: None, how: str, error: str):
+    actors = ranks(1)
+    with (
+        pytest.raises(ray.exceptions.RayError, match=error),
+        Peers(actors, THREE, WAIT_S).joining("step", how),
+    ):
         pass
-
-
-def test_an_error_of_the_first_is_its_own(ranks_of: Callable[[int], list[Any]]):
-    with pytest.raises(KeyError, match="mine"), Peers(ranks_of(1), THREE, WAIT_S).joining("step", "hangs"):
-        raise KeyError("mine")
+    ray.kill(actors[0])
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
