@@ -258,7 +258,7 @@ class Handler(BaseHTTPRequestHandler):
             raise RefusedError(403, message=f"you may not create repositories under {owner}")
         key = given.get("type", "model"), f"{owner}/{given['name']}"
         if key in self.server.repos:
-            raise RefusedError(409, message="You already created this repo")
+            return self._json({"error": "exists", "url": f"{self.server.url}/{key[1]}"}, 409)
         repo = self.server.repos[key] = Repo(private=given.get("visibility") == "private")
         attributes = b"*.safetensors filter=lfs diff=lfs merge=lfs -text\n"
         file = File(git_oid(attributes), len(attributes), self.server.keep(attributes), lfs=False)

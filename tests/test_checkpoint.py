@@ -139,9 +139,7 @@ def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
         newest_whole(tmp_path)
     path = save_checkpoint(tmp_path, state_writer(3))
     (path / PRETRAINED / "model.safetensors").write_text("WEIGHTS")
-    with pytest.raises(
-        InputError, match=r"000003: pretrained_model/model.safetensors is not what was written"
-    ):
+    with pytest.raises(InputError, match="000003: pretrained_model/model.safetensors is not what was"):
         newest_whole(tmp_path)
     manifest = json.loads((path / "manifest.json").read_text())
     (path / "manifest.json").write_text(json.dumps(manifest | {"format": 9}))
@@ -150,7 +148,7 @@ def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
     manifest["files"]["../../outside"] = {"size": 1, "sha256": "0"}
     (path / "manifest.json").write_text(json.dumps(manifest))
     (path / PRETRAINED / "model.safetensors").write_text("weights")
-    with pytest.raises(InputError, match=r"json is broken \(../../outside: it leads out of the"):
+    with pytest.raises(InputError, match=r"json is broken \(.*\./outside: it leads out of the"):
         newest_whole(tmp_path)
 
 
@@ -197,11 +195,6 @@ def test_a_backbone_by_its_bare_name_is_the_one_beside_and_one_from_the_hub_stay
     assert not displaced(tmp_path)
 
 
-def there_and_back(tree: Any, folder: Path) -> Any:
-    snapshot.save(folder / "tree", tree)
-    return snapshot.load(folder / "tree")
-
-
 def test_what_goes_in_comes_out(tmp_path: Path):
     tree = {
         "plain": [None, True, -3, 0.1, "text", float("inf"), 2**100],
@@ -215,7 +208,8 @@ def test_what_goes_in_comes_out(tmp_path: Path):
         ],
         "empty": {},
     }
-    back = there_and_back(tree, tmp_path)
+    snapshot.save(tmp_path / "tree", tree)
+    back = snapshot.load(tmp_path / "tree")
     arrays, expected = back.pop("arrays"), tree.pop("arrays")
     assert back == tree
     assert arrays[1] == 1.5
@@ -230,12 +224,11 @@ def test_known_kinds_tensors_and_generators(tmp_path: Path):
     rng.random(5)
     segment = make_segment("a", n=3, version=[1, 2, 3], success=True)
     tensor = torch.arange(6.0).reshape(2, 3).T
-    back = there_and_back(
-        {"segment": segment, "rng": rng, "tensor": tensor, "origin": [SegmentStart("t", 3, 1)]}, tmp_path
-    )
-    assert (
-        back["origin"] == [SegmentStart("t", 3, 1)] and back["segment"].key == "a" and back["segment"].success
-    )
+    start = SegmentStart("t", 3, 1)
+    tree = {"segment": segment, "rng": rng, "tensor": tensor, "start": [start]}
+    snapshot.save(tmp_path / "tree", tree)
+    back = snapshot.load(tmp_path / "tree")
+    assert back["start"] == [start] and back["segment"].key == "a" and back["segment"].success
     np.testing.assert_array_equal(back["segment"].version, [1, 2, 3])
     assert back["rng"].random(3).tolist() == rng.random(3).tolist()
     assert torch.equal(back["tensor"], tensor)

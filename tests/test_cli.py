@@ -45,6 +45,11 @@ def test_help_answers_without_torch_or_lerobot() -> None:
         assert f"\n  {verb} " in done.stdout
 
 
+def test_an_unknown_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["trian"]) == 2
+    assert capsys.readouterr().err.startswith("accerl: VERB='trian': use one of train, demos, ")
+
+
 @pytest.mark.parametrize("verb", list(cli.VERBS))
 def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([verb, "--help"]) == 0
@@ -66,18 +71,6 @@ class RayTaskError(InputError):
 
     def __str__(self) -> str:
         return "Traceback\n  File"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["trian"], "VERB='trian': did you mean train? Otherwise use one of train, demos, "),
-        (["train", "--help=trainr"], "--help='trainr': use all or one of env, dataset"),
-    ],
-)
-def test_an_unknown_verb_or_section(arguments: list[str], line: str, capsys) -> None:
-    assert cli.main(arguments) == 2
-    assert capsys.readouterr().err.startswith(f"accerl: {line}")
 
 
 @pytest.mark.parametrize(
@@ -193,7 +186,7 @@ def test_eval_in_one_process(tmp_path, tiny_checkpoint, capsys):
     assert summary == kept, "the seeds are in the file alone"
     assert summary["n"] == 4 and 0 <= summary["ci95"][0] <= summary["success"] <= summary["ci95"][1] <= 1
     assert len(list(out.glob("match_*.mp4"))) == 4
-    assert "n=4" in stderr
+    assert "95 % Wilson" in stderr
     assert cli.main(arguments) == 2
     assert "the folder exists" in capsys.readouterr().err
 

@@ -214,6 +214,23 @@ READ = {FRONT: {"type": "VISUAL", "shape": [3, 32, 32]}, STATE: {"type": "STATE"
         ({"observation.images.top": IMAGE}, "", {"input_features": READ}, None),
     ],
 )
+@pytest.mark.parametrize(
+    ("field", "least", "name"), [("max_state_dim", 4, STATE), ("max_action_dim", 2, "action")]
+)
+def test_more_numbers_than_a_policy_pads_to_are_refused(field: str, least: int, name: str, tmp_path: Path):
+    dataset = write_dataset(tmp_path / "data", more={FRONT: IMAGE})
+    spec = make_environment(SimulatedConfig()).spec
+
+    def check(size: int) -> None:
+        sft = SFTConfig(steps=1, policy={"type": "smolvla", field: size})
+        check_training_data(sft, dataset, check_sft_policy(sft), spec, {})
+
+    check(least)
+    why = f"sft.policy.{field}={least - 1}: {name} has {least} numbers; use {least}"
+    with pytest.raises(InputError, match=why):
+        check(least - 1)
+
+
 def test_what_a_policy_reads_of_a_dataset_is_looked_at_before_any_work(
     features: dict[str, Any], without: str, policy: dict[str, Any], why: str | None, tmp_path: Path
 ):

@@ -4,11 +4,9 @@
 Tests of single configs add nothing to this; rules between several fields are in one table, `RULES`.
 """
 
-import dataclasses
 import math
 import typing
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -134,22 +132,3 @@ def test_values_that_fit_an_annotation(hint: Any, fits: list[Any], does_not: lis
     for value in does_not:
         with pytest.raises(InputError, match=r"^field="):
             check(hint, value, "field")
-
-
-def test_a_range_is_written_as_an_interval():
-    with pytest.raises(ValueError, match="write an interval"):
-        Range("0..1")
-
-
-def test_a_field_with_another_default_keeps_its_range():
-    @dataclass(frozen=True, kw_only=True)
-    class Base(Section):
-        share: Share = 0.5
-
-    @dataclass(frozen=True, kw_only=True)
-    class Mine(Base, section="mine"):
-        share: float = 0.7
-
-    assert dataclasses.asdict(Mine(share=1)) == {"share": 1}
-    with pytest.raises(InputError, match=r"^mine\.share=2: use a number in \[0, 1\]$"):
-        Mine(share=2)

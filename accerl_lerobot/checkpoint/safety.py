@@ -131,7 +131,7 @@ def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
         content = yaml.safe_load(text) if is_yaml else json.loads(text)
     except FileNotFoundError as error:
         raise origin.refuse(path.name, "is missing; give the whole folder") from error
-    except (OSError, RecursionError, ValueError, yaml.YAMLError) as error:
+    except Exception as error:  # it may hold anything
         language = "YAML" if is_yaml else "JSON"
         raise origin.refuse(path.name, f"not good {language} ({in_one_line(error)})") from error
     if not isinstance(content, dict):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import logging
 import os
 import signal
@@ -72,9 +71,7 @@ def run(verb: str, rest: list[str]) -> int:
 
     set_up_logging()
     if verb not in VERBS:
-        near = difflib.get_close_matches(verb, VERBS, n=1)
-        hint = f"did you mean {near[0]}? Otherwise use" if near else "use"
-        raise InputError("VERB", verb, f"{hint} one of {', '.join(VERBS)}")
+        raise InputError("VERB", verb, f"use one of {', '.join(VERBS)}")
     section = help_asked(rest)
     if section is not None:
         return show_help(verb, rest, section)

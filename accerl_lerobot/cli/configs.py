@@ -20,8 +20,6 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import StateModelConfig, WorldModelConfig
 
-NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
-
 
 @dataclass(frozen=True, kw_only=True)
 class DemosRun(Section):
@@ -58,6 +56,14 @@ class SFTRun(NewFolderRun):
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     sft: SFTConfig = field(default_factory=SFTConfig)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dataset.repo_id is None:
+            hint = "name a LeRobotDataset, on the Hub or with dataset.root"
+            raise InputError("dataset.repo_id", None, hint)
+        if self.sft.steps == 0:
+            raise InputError("sft.steps", 0, "use at least 1")
+
 
 @dataclass(frozen=True, kw_only=True)
 class OfflineRun(NewFolderRun):
@@ -86,8 +92,6 @@ class OfflineRun(NewFolderRun):
             raise InputError("world_model.type", self.world_model.type, no_use_for_states(self.algorithm))
         if self.policy.path is None:
             raise InputError("policy.path", None, "give a LeRobot checkpoint; accerl sft makes one")
-        if self.dataset.repo_id is None:
-            raise InputError("dataset.repo_id", None, NO_DATASET)
         if self.trainer.ranks != 1:
             raise InputError("trainer.ranks", self.trainer.ranks, "offline learning is one process; use 1")
 

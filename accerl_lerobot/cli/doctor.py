@@ -6,6 +6,7 @@ A frame is really drawn, in a process of its own, because a broken OpenGL can ta
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import importlib.util
 import math
@@ -18,9 +19,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from accerl_lerobot.config.machine import GIB, memory_gib
+from accerl_lerobot.config.machine import GIB, free_memory_gib
 from accerl_lerobot.engines.config import lag_limits
-from accerl_lerobot.errors import InputError, check_absent, expanded, in_one_line
+from accerl_lerobot.errors import InputError, check_absent, expanded, in_one_line, last_exception
 
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import RunConfig
@@ -58,14 +59,14 @@ def compared(name: str, text: str, suffices: bool, hint: str) -> Check:
 def main(arguments: list[str]) -> int:
     """``accerl doctor``; 0 if everything needed is there, otherwise 1."""
     checks: list[Check] = []
-    try:
-        if arguments:
+    if arguments:
+        try:
             checks += recipe(arguments)
-    except InputError as error:
-        checks.append(Check("recipe", FAIL, str(error)))
-    checks += machine(joins=any(argument.startswith("--launch.address") for argument in arguments))
-    if not arguments:
+        except InputError as error:
+            checks.append(Check("recipe", FAIL, str(error)))
+    else:
         checks.append(rendering(needed=True))
+    checks += machine(joins=any(argument.startswith("--launch.address") for argument in arguments))
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
@@ -78,7 +79,7 @@ def machine(*, joins: bool = False) -> Iterator[Check]:
     yield Check("python", OK, f"{platform.python_version()} in {sys.prefix}")
     yield from libraries(joins)
     yield Check("cpu", OK, f"{len(os.sched_getaffinity(0))} cores")
-    yield Check("memory", OK, f"{memory_gib('MemAvailable'):.1f} GiB free")
+    yield Check("memory", OK, f"{free_memory_gib():.1f} GiB free")
     disk = shutil.disk_usage(Path.cwd()).free / GIB
     yield compared("disk", f"{disk:.0f} GiB free here", disk >= DISK_GIB, f"a run may need {DISK_GIB:.0f}")
 
@@ -87,18 +88,16 @@ def libraries(joins: bool) -> Iterator[Check]:
     """LeRobot, Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
     from accerl_lerobot.engines import ray_session
 
-    try:
-        yield Check("lerobot", OK, importlib.metadata.version("lerobot"))
-        ray_session.prepare(joins)
-        import ray
+    ray_session.prepare(joins)
+    for name in ("lerobot", "ray", "torch"):
+        try:
+            importlib.import_module(name)
+        except Exception as error:
+            yield Check(name, FAIL, f"it cannot be imported ({in_one_line(error)}); run make setup")
+            return
+        yield Check(name, OK, importlib.metadata.version(name))
+    import torch
 
-        yield Check("ray", OK, ray.__version__)
-        import torch
-
-        yield Check("torch", OK, str(torch.__version__))
-    except Exception as error:
-        yield Check("libraries", FAIL, f"one cannot be imported ({in_one_line(error)}); run make setup")
-        return
     text = "none"
     if torch.cuda.is_available():
         gib = torch.cuda.get_device_properties(0).total_memory / GIB
@@ -119,8 +118,8 @@ def rendering(*, needed: bool) -> Check:
         hint = "set MUJOCO_GL to osmesa or egl"
         return Check("rendering", failure, f"no frame within {RENDER_TIMEOUT_S} s; {hint}")
     if done.returncode:
-        lines = done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"]
-        return Check("rendering", failure, lines[-1].removeprefix("accerl_lerobot.errors.InputError: "))
+        why = last_exception(done.stderr) or f"ended with code {done.returncode}"
+        return Check("rendering", failure, why.removeprefix("accerl_lerobot.errors.InputError: "))
     return Check("rendering", OK, "MuJoCo draws 64 × 64 pixels")
 
 

@@ -27,15 +27,7 @@ from accerl_lerobot.checkpoint.layout import (
     write_atomically,
     write_json,
 )
-from accerl_lerobot.cli.configs import (
-    NO_DATASET,
-    DemosRun,
-    EvalRun,
-    OfflineRun,
-    SFTRun,
-    WorldModelEvalRun,
-    WorldModelRun,
-)
+from accerl_lerobot.cli.configs import DemosRun, EvalRun, OfflineRun, SFTRun, WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.console import Console, count, duration, number, rate
@@ -94,10 +86,6 @@ def demos(arguments: list[str]) -> int:
 def sft(arguments: list[str]) -> int:
     """``accerl sft``."""
     config: SFTRun = parse(SFTRun, arguments, recipe_class=RunConfig)
-    if config.dataset.repo_id is None:
-        raise InputError("dataset.repo_id", None, NO_DATASET)
-    if config.sft.steps == 0:
-        raise InputError("sft.steps", 0, "use at least 1")
     from accerl_lerobot.policies.loading import resolve_device
     from accerl_lerobot.run.preflight import check_environment, check_training_data, sft_policy
     from accerl_lerobot.run.train import fine_tune, make_output_dir
@@ -224,8 +212,6 @@ def _checked(
     config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
 ) -> int:
     """Do `work` in a new folder; returns 0 if the world model has passed its check, otherwise 1."""
-    if config.dataset.repo_id is None:
-        raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.world_model.pretrain import show
 
     found, directory, console = _in_new_folder(config, work)

@@ -7,6 +7,7 @@ import ast
 import dataclasses
 import inspect
 import textwrap
+from collections import defaultdict
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -77,18 +78,16 @@ def _capital(text: str) -> str:
 
 def docstrings(cls: type[Any]) -> dict[str, str]:
     """Field name → the docstring under it, those of base classes included; "" where there is none."""
-    texts: dict[str, str] = {}
+    texts: dict[str, str] = defaultdict(str)
     for base in reversed(cls.__mro__):
         if not dataclasses.is_dataclass(base):
             continue
         node = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
         assert isinstance(node, ast.ClassDef)
-        for pair in pairwise([*node.body, ast.Pass()]):
+        for pair in pairwise(node.body):
             match pair:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                     texts[name] = " ".join(text.split())
-                case ast.AnnAssign(target=ast.Name(id=name)), _:
-                    texts.setdefault(name, "")
     return texts
 
 
@@ -113,17 +112,15 @@ def _lines(cls: type[Any], prefix: str = "", default: Any = None, usual: bool = 
             note = " (off unless given)" if inner is None else ""
             yield Line(dotted, None, f"{dotted}{note}: {_summary(section)}", usual)
             yield from _lines(section, f"{dotted}.", inner, usual)
+            continue
         chosen = getattr(inner, TYPE, None)
         if chosen is not None:
             yield Line(f"{dotted}.{TYPE}", chosen, " | ".join(types), usual)
         for kind, subclass in types.items():
-            heading = f"{dotted}.{TYPE}={kind}"
-            if kind == chosen:
-                yield Line(dotted, None, f"{heading} (default): {_summary(subclass)}", usual)
-                yield from _lines(subclass, f"{dotted}.", inner, usual)
-            else:
-                yield Line(dotted, None, f"{heading}: {_summary(subclass)}", usual)
-                yield from _lines(subclass, f"{dotted}.", usual=False)
+            default_one = kind == chosen
+            note = " (default)" if default_one else ""
+            yield Line(dotted, None, f"{dotted}.{TYPE}={kind}{note}: {_summary(subclass)}", usual)
+            yield from _lines(subclass, f"{dotted}.", inner if default_one else None, usual and default_one)
 
 
 def in_words(annotation: Any) -> str:

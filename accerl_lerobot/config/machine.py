@@ -21,18 +21,15 @@ SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
 DISK_BYTES = 2**29  # disk space that demonstrations, checkpoints and videos take at least
 
 
-def memory_gib(entry: str) -> float:
-    """``MemTotal`` or ``MemAvailable`` of this machine within its container's limit."""
-    memory = psutil.virtual_memory()
-    free = entry == "MemAvailable"
-    found = float(memory.available if free else memory.total)
+def free_memory_gib() -> float:
+    """Free memory of this machine within its container's limit."""
+    free = int(psutil.virtual_memory().available)
     group = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
         limit = int((group / "memory.max").read_text())
-        if free:
-            limit -= int((group / "memory.current").read_text())
-        found = min(found, limit)
-    return found / GIB
+        used = int((group / "memory.current").read_text())
+        free = min(free, limit - used)
+    return free / GIB
 
 
 def check_disk(folder: str | None, field: str = "output_dir") -> None:

@@ -2,10 +2,10 @@
 """Command lines and recipes into configs, and every mistake in them into one line.
 
 The conventions are LeRobot's: dotted flags, sections, and a ``type`` that chooses one config of several.
-Reading and merging is done here and not by draccus's argument parser, for four reasons. A field of a choice
+Reading and merging is done here and not by draccus's argument parser, for five reasons. A field of a choice
 (``--algorithm.sigma``) needs no second ``--algorithm.type``. An unknown key is named together with what it
-resembles. A key that stands twice in a file is refused. Every verb can read the recipe of a whole run and
-take the sections it needs.
+resembles. A key that stands twice in a file is refused. A recipe can name another one as its base. Every verb
+can read the recipe of a whole run and take the sections it needs.
 """
 
 from __future__ import annotations
@@ -40,15 +40,13 @@ PLUGINS = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobo
 LEROBOTS_FILES = ("config.json", "train_config.json")  # of a policy's folder, taken for recipes by mistake
 RECIPES = "recipes"
 TYPE = "type"  # the key that picks one config of several, as in ``env.type``
-REGISTERS = "registers"
-"""In a field's metadata: the package that it names registers types of the section that the field is in."""
+BASE = "base"  # the key that names the recipe on which another one is laid
 PREPARES = "prepares"
-"""In the same field's metadata: a function to call before the package is imported."""
+"""In the metadata of a field `DISCOVER`: a function to call before the package is imported."""
 CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 """Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
 command line can set them. A recipe may have come with the very code that it would allow."""
-UNSET: tuple[Any, ...] = (None, False, "", [], {})
 OF_LEROBOT = {
     "steps": "use trainer.updates, or sft.steps",
     "batch_size": "use trainer.batch_decisions, or sft.batch_size",
@@ -56,21 +54,19 @@ OF_LEROBOT = {
     "save_freq": "use save_every_updates",
     "eval_freq": "use evaluation.every_updates",
     "env_eval_freq": "use evaluation.every_updates",
-    "eval.n_episodes": "use evaluation.episodes",
-    "eval.batch_size": "use rollout.environments",
+    "eval": "use evaluation.episodes and rollout.environments",
     "rename_map": "use policy.rename_map",
-    "optimizer.lr": "use trainer.lr, or sft.lr",
+    "optimizer": "use trainer.lr, or sft.lr",
     "policy.type": "use policy.path, or sft.policy.type",
     "policy.pretrained_path": "use policy.path, or sft.init_path",
     "policy.use_amp": "use policy.precision=bf16",
     "policy.push_to_hub": "use accerl push afterwards",
     "policy.repo_id": "use accerl push afterwards",
-    "peft.r": "use policy.tuning.mode=lora and policy.tuning.rank",
-    "peft.method_type": "use policy.tuning.mode=lora",
+    "peft": "use policy.tuning.mode=lora and policy.tuning.rank",
     "wandb.mode": "set WANDB_MODE in the environment",
     "wandb.entity": "set WANDB_ENTITY in the environment",
 }
-"""Flags of ``lerobot-train`` that people type here, and what stands for each."""
+"""Flags and sections of ``lerobot-train`` that people type here, and what stands for each."""
 
 
 def imported(path: str) -> Any:
@@ -129,16 +125,25 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
             and ``output_dir`` is, so that one recipe serves several verbs.
     """
     path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
-    tree = {} if path is None else read_recipe(path)
+    register_types(config_class, given)
+    tree = {} if path is None else _on_its_base(read_recipe(path), recipe_class or config_class)
     if recipe_class is not None:
         tree = _for_verb(tree, config_class, recipe_class)
-    register_types(config_class, given)
     merged = _overridden(config_class, tree, given)
     from_file = consents(merged, given)
     for name, value in from_file.items():
         hint = "a file cannot allow this, only the command line can: if you trust it, add"
         raise InputError(name, value, f"{hint} {consent_flags(from_file)}")
     return decode(config_class, merged)
+
+
+def _on_its_base(tree: dict[str, Any], config_class: type[Any]) -> dict[str, Any]:
+    """A recipe with what it does not say taken from the recipe that its key `BASE` names, if it has one."""
+    if BASE not in tree:
+        return tree
+    over = dict(tree)
+    base = expanded(str(over.pop(BASE)), BASE)
+    return _overridden(config_class, _on_its_base(read_recipe(base), config_class), over)
 
 
 def _for_verb(tree: dict[str, Any], config_class: type[Any], recipe_class: type[Any]) -> dict[str, Any]:
@@ -166,7 +171,7 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     found = {}
     for name, value in leaves(tree, lists=True):
         key = name.rpartition(".")[2]
-        if key in CONSENT and value not in UNSET and name not in allowed:
+        if key in CONSENT and value and name not in allowed:
             found[name] = value
     return found
 
@@ -203,7 +208,6 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
 
     Bare arguments are entries of the list that `bare` names; without it, the one there may be is the recipe.
     """
-    recipes: list[str] = []
     entries: list[str] = []
     given: dict[str, Any] = {}
     rest = list(arguments)
@@ -217,19 +221,15 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
             if not rest or rest[0].startswith("--"):
                 raise InputError(key, "", f"give it a value: --{key}=…")
             value = rest.pop(0)
-        if key == "config_path":
-            recipes.append(value)
-        else:
-            _set(given, key, _value(value))
-    if bare is None:
-        recipes += entries
-    elif entries:
+        _set(given, key, _value(value))
+    if entries and bare is not None:
         _set(given, bare, entries)
-    if not recipes:
+    elif entries:
+        _set(given, "config_path", " ".join(entries))
+    recipe = given.pop("config_path", None)
+    if recipe is None:
         return None, given
-    if len(recipes) > 1:
-        raise InputError("config_path", recipes[1], "there is another one already; give one recipe")
-    path = expanded(recipes[0], "config_path")
+    path = expanded(str(recipe), "config_path")
     return _recipe_path(path), given
 
 
@@ -269,16 +269,9 @@ def read_recipe(path: Path) -> dict[str, Any]:
         in_repository = str(path.parent) == RECIPES
         name = path.stem if in_repository else str(path)
         path = shipped.get(name, path)
-    if path.is_dir():
-        hint = f"a folder without {CONFIG}, so no run or checkpoint; name a recipe"
-        raise InputError("config_path", str(path), hint)
     if not path.is_file():
-        names = [*map(str, path.parent.glob("*.y*ml")), *shipped]
-        near = difflib.get_close_matches(str(path), names, n=3)
-        hint = f"this package has {', '.join(shipped)}"
-        if near:
-            hint = f"did you mean {' or '.join(near)}"
-        raise InputError("config_path", str(path), f"no such file; {hint}")
+        what = f"a folder without {CONFIG}" if path.is_dir() else "no such file"
+        raise InputError("config_path", str(path), f"{what}; this package has {', '.join(shipped)}")
     if path.name in LEROBOTS_FILES:
         hint = "resume a run with RUN/config.yaml, and name a policy's folder by policy.path"
         raise InputError("config_path", str(path), f"LeRobot wrote it; {hint}")
@@ -347,12 +340,11 @@ def choices_of(section: type[Any]) -> dict[str, type[Any]]:
 def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] = ()) -> None:
     """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
     for field in dataclasses.fields(cls):
-        package = tree.get(field.name)
-        if field.metadata.get(REGISTERS) and package is not None:
+        if field.name == DISCOVER and tree.get(DISCOVER) is not None:
             prepare = field.metadata.get(PREPARES)
             if prepare is not None:
                 prepare()
-            discover(str(package), ".".join(path))
+            discover(str(tree[DISCOVER]), ".".join(path))
     for name, section in sections_of(cls).items():
         if isinstance(tree.get(name), dict):
             register_types(section, tree[name], (*path, name))
@@ -373,16 +365,15 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         over = given[name]
         if not isinstance(under, dict) or not isinstance(over, dict):
             continue
-        if name not in sections:  # fields of LeRobot's or of a simulator's, such as `sft.policy`
-            other = over.get(TYPE, under.get(TYPE)) != under.get(TYPE)
-            merged[name] = over if other else under | over
-            continue
-        places = ("path", "repo_id")
-        if any(place in over and over[place] != under.get(place) for place in places):
-            under = {key: value for key, value in under.items() if key != "revision"}  # of another repository
-        section = sections[name]
-        former = under.get(TYPE, getattr(defaults[name], TYPE, None))
+        former = under.get(TYPE, getattr(defaults.get(name), TYPE, None))
         chosen = over.get(TYPE, former)
+        if name not in sections:  # fields of LeRobot's or of a simulator's, such as `sft.policy`
+            merged[name] = under | over if chosen == former else over
+            continue
+        for place in ("path", "repo_id"):
+            if over.get(place, under.get(place)) != under.get(place):  # the revision is of another repository
+                under = {key: value for key, value in under.items() if key != "revision"}
+        section = sections[name]
         kind = choices_of(section).get(str(chosen), section)
         if chosen != former:
             under = _fitting(kind, under)
@@ -415,18 +406,27 @@ def encoded_defaults(cls: type[Any]) -> dict[str, Any]:
     return {name: draccus.encode(default) for name, default in defaults_of(cls).items()}
 
 
-def _decoded(
-    cls: type[Any], tree: dict[str, Any], default: Any, path: tuple[str, ...], whole: type[Any]
-) -> Any:
-    """A config section; fields that `tree` does not give are those of `default`, if it is of this class.
+def _decoded(cls: type[Any], tree: Any, default: Any, path: tuple[str, ...], whole: type[Any]) -> Any:
+    """A config section of the type that `tree` names, or of the type of its default.
 
-    `path` is where the section stands in the config `whole`.
+    Fields that `tree` does not give are those of `default`, if it is of this type. `path` is where the
+    section stands in the config `whole`.
     """
+    dotted = ".".join(path)
+    if not isinstance(tree, dict | None):
+        raise InputError(dotted, tree, f"a config section; use --{path[-1]}.field=value")
+    given = dict(tree or {})
+    choices = choices_of(cls)
+    if choices:
+        kind = given.pop(TYPE, getattr(default, TYPE, None))
+        if str(kind) not in choices:
+            raise InputError(f"{dotted}.{TYPE}", kind, f"use one of {', '.join(sorted(choices))}")
+        cls = choices[str(kind)]
     annotations = annotations_of(cls)
     sections = sections_of(cls)
     base = default if type(default) is cls else None
     values: dict[str, Any] = {}
-    for key, value in tree.items():
+    for key, value in given.items():
         place = (*path, str(key))
         if key not in annotations:
             raise _unknown(place, value, list(annotations), whole)
@@ -435,38 +435,17 @@ def _decoded(
             values[key] = _converted(annotation, value)
         else:
             usual = defaults_of(cls)[key] if base is None else getattr(base, key)
-            values[key] = _section(sections[key], value, usual, place, whole)
-    own = getattr(cls, "SECTION", "")
-    actual = ".".join(path)
+            values[key] = _decoded(sections[key], value, usual, place, whole)
     try:
         return cls(**values) if base is None else dataclasses.replace(base, **values)
     except InputError as error:
-        # A section that stands in several places, such as a dataset, has one name for itself.
-        section, _, key = error.field.rpartition(".")
-        if section not in (own, actual):
+        own = f"{getattr(cls, 'SECTION', '')}."
+        actual = f"{dotted}."
+        if actual in (".", own) or not error.field.startswith(own):
             raise
-        value = tree.get(key, error.value)  # as it was typed
-        hint = error.hint.replace(f"{own}.", f"{actual}.") if own else error.hint
-        field = f"{actual}.{key}" if actual else key
-        raise InputError(field, value, hint) from error
-
-
-def _section(section: type[Any], value: Any, default: Any, path: tuple[str, ...], whole: type[Any]) -> Any:
-    """A section of the type that `value` names, or of its default's."""
-    dotted = ".".join(path)
-    if not isinstance(value, dict | None):
-        raise InputError(dotted, value, f"a config section; use --{path[-1]}.field=value")
-    value = value or {}
-    choices = choices_of(section)
-    if choices:
-        kind = value.get(TYPE, getattr(default, TYPE, None))
-        if not isinstance(kind, str) or kind not in choices:
-            near = difflib.get_close_matches(str(kind), choices, n=1)
-            hint = f"did you mean {near[0]}? Otherwise use" if near else "use"
-            raise InputError(f"{dotted}.{TYPE}", kind, f"{hint} one of {', '.join(sorted(choices))}")
-        section = choices[kind]
-        value = {name: entry for name, entry in value.items() if name != TYPE}
-    return _decoded(section, value, default, path, whole)
+        # A section that stands in several places, such as a dataset, has one name for itself.
+        field = error.field.replace(own, actual, 1)
+        raise InputError(field, error.value, error.hint.replace(own, actual)) from error
 
 
 def _converted(kind: Any, value: Any) -> Any:
@@ -522,9 +501,8 @@ def _unknown(place: tuple[str, ...], value: Any, names: list[str], whole: type[A
     """The error for a field that a config does not have. It names similar fields, or all of the section."""
     *path, key = place
     name = ".".join(place)
-    for flag, leaf in leaves(value, name):
-        if flag in OF_LEROBOT:
-            return InputError(flag, leaf, f"the name is LeRobot's; {OF_LEROBOT[flag]}")
+    if name in OF_LEROBOT:
+        return InputError(name, value, f"the name is LeRobot's; {OF_LEROBOT[name]}")
     near = [".".join((*path, other)) for other in difflib.get_close_matches(key, names, n=3)]
     for other in dotted_fields(whole):
         if other.rpartition(".")[2] == key and other not in (name, *near):

@@ -79,7 +79,6 @@ Steps = Annotated[int, Range("[0, 1000000000]")]  # a number of steps, updates o
 Device = Annotated[str, Pattern(r"auto|cpu|cuda(:\d{1,2})?", "auto, cpu, cuda or cuda:0")]
 Threads = Annotated[int, Range("[1, 1024]")]
 NewFolder = Annotated[str, Pattern(r"(?s).+", "the name of a folder to create")]
-DatasetName = Annotated[str, Pattern(r"[^/]+/[^/]+", "the form owner/name")]
 Repeats = Annotated[int, Range("[1, 100000]")]
 Commit = Annotated[str, Pattern(r"[0-9a-f]{40}", "the 40 hexadecimal digits of a commit")]
 
@@ -162,16 +161,7 @@ def annotations_of(cls: type[Any]) -> dict[str, Any]:
 
 @functools.cache
 def _annotations_of(cls: Any) -> dict[str, Any]:
-    annotations: dict[str, Any] = {}
-    inherited: dict[str, Any] = {}  # without ranges
-    for base in reversed(cls.__mro__):
-        if not dataclasses.is_dataclass(base):
-            continue
-        for name, annotation in typing.get_type_hints(base, include_extras=True).items():
-            # A subclass that gives a field another default need not repeat its range.
-            if annotation != inherited.get(name):
-                annotations[name] = annotation
-        inherited = typing.get_type_hints(base)
+    annotations = typing.get_type_hints(cls, include_extras=True)
     return {field.name: annotations[field.name] for field in dataclasses.fields(cls)}
 
 

@@ -26,7 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from accerl_lerobot import guardian
-from accerl_lerobot.config.machine import SIMULATOR_GIB, memory_gib
+from accerl_lerobot.config.machine import SIMULATOR_GIB, free_memory_gib
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
@@ -226,7 +226,7 @@ def simulated[Item, Result](
     # Each process comes to hold a simulator of every task.
     tasks = getattr(env_config, "tasks", ("one",))
     each = len(tasks) * SIMULATOR_GIB.get(env_config.type, 0.1)
-    fitting = (memory_gib("MemAvailable") or math.inf) / each
+    fitting = free_memory_gib() / each
     cores = len(os.sched_getaffinity(0))
     processes = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting)))
     with simulators(processes, _open_environment, env_config) as pool:

@@ -206,9 +206,7 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     """``module:function`` of the scripted expert for demonstrations: given an environment and a task, it
     returns a function whose every call is the action (A,) for the state that the environment is in."""
 
-    discover_packages_path: str | None = field(
-        default=None, metadata={"registers": True, "prepares": start_graphics}
-    )
+    discover_packages_path: str | None = field(default=None, metadata={"prepares": start_graphics})
     """Package to import that registers ``env.type``, ``env.id`` or ``env.name``, where that is not one of
     ours, Gymnasium's or LeRobot's; every machine of the cluster needs it."""
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500

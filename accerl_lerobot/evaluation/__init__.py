@@ -18,6 +18,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.config.ranges import Range, Section, Steps
+from accerl_lerobot.console import rate
 from accerl_lerobot.errors import for_viewing
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import eval_seed
@@ -55,8 +56,6 @@ class Rate:
         """
         from scipy.stats import binomtest
 
-        if not 0 <= self.successes <= self.n:
-            raise ValueError(f"{self.successes} successes in {self.n} episodes")
         if self.n == 0:
             return Interval(0.0, 1.0)
         interval = binomtest(self.successes, self.n).proportion_ci(method="wilson")
@@ -111,19 +110,18 @@ def notes(results: Sequence[EpisodeResult]) -> list[str]:
 
 def table(summary: dict[str, Any], title: str) -> Table:
     """`summarise`'s numbers for the terminal."""
-    out = Table("task", "success [95 % Wilson]", title=title)
+    out = Table("task", "success [95 % Wilson]", "episodes", title=title)
     rows = dict(summary["tasks"])
     if len(rows) > 1:
         rows["all"] = summary
     for name, entry in rows.items():
-        n = entry["n"]
-        out.add_row(name, str(Rate(successes=round(entry["success"] * n), n=n)))
+        out.add_row(name, rate(entry["success"], entry["ci95"]), str(entry["n"]))
     return out
 
 
 def _rate(results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    rate = rate_of(results)
-    return {"success": rate.value, "n": rate.n, "ci95": list(rate.interval())}
+    found = rate_of(results)
+    return {"success": found.value, "n": found.n, "ci95": list(found.interval())}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,11 +262,8 @@ def _with_outcome(result: EpisodeResult) -> list[np.ndarray]:
 
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
-    """Pictures beside (axis 1) or below (axis 0) each other, white between them."""
-    shape = list(pictures[0].shape)
-    shape[axis] = GAP
-    gap = np.full(shape, 255, np.uint8)
-    parts = [pictures[0]]
-    for picture in pictures[1:]:
-        parts += [gap, picture]
+    """Pictures beside (axis 1) or below (axis 0) each other, with a white margin behind each."""
+    margin = [(0, 0), (0, 0), (0, 0)]
+    margin[axis] = (0, GAP)
+    parts = [np.pad(picture, margin, constant_values=255) for picture in pictures]
     return np.concatenate(parts, axis=axis)

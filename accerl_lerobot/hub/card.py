@@ -56,8 +56,8 @@ NEEDED = {
     DATASET: (INFO, "meta/tasks.parquet", "meta/episodes", "data"),
 }
 KEPT = {
-    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "success_by_task.png", "before_after.mp4"),
-    WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
+    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
+    WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4"),
     DATASET: (),
 }
 """Artifact type → files of its run that go with it."""
@@ -200,8 +200,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     texts = {}
     for name in (RECIPE, SUMMARY, EVALUATION, VALIDATION):
         content = files.get(f"{FOLDER}/{name}", b"")
-        if isinstance(content, Path):
-            content = content.read_bytes()
+        assert isinstance(content, bytes)  # see `transfer.without_paths`
         texts[name] = content.decode()
     recipe = yaml.safe_load(texts[RECIPE]) or {}
     summary = json.loads(texts[SUMMARY] or "{}")
@@ -217,7 +216,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
             library_name="lerobot",
             pipeline_tag="robotics",
             tags=[tag for tag in tags if tag],
-            datasets=_datasets(recipe) or None,
+            datasets=_datasets(recipe),
             base_model=_base_model(recipe),
         ),
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
@@ -270,14 +269,12 @@ def dataset_card(repo_id: str, folder: Path) -> str:
     return str(card)
 
 
-def _datasets(recipe: Mapping[str, Any]) -> list[str]:
-    """Datasets on the Hub; beside a folder the name is a label."""
-    names = []
-    for name in ("dataset", "online"):
-        section = recipe.get(name) or {}
-        if section.get("repo_id") and not section.get("root"):
-            names.append(section["repo_id"])
-    return names
+def _datasets(recipe: Mapping[str, Any]) -> list[str] | None:
+    """The dataset of a run on the Hub; beside a folder the name is a label."""
+    dataset = recipe.get("dataset") or {}
+    if dataset.get("root") or not dataset.get("repo_id"):
+        return None
+    return [dataset["repo_id"]]
 
 
 def _base_model(recipe: Mapping[str, Any]) -> str | None:

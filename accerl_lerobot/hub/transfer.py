@@ -37,10 +37,9 @@ from huggingface_hub.utils import filter_repo_objects
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import FileSource, leads_out, matching_files, unsafe_name
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import InputError, check_absent, expanded, last_exception
 from accerl_lerobot.hub.card import (
     CARD,
-    CONFIG,
     CONTENTS,
     DATASET,
     MARK,
@@ -93,8 +92,8 @@ def hub_errors(repo_id: str, revision: str | None) -> Iterator[None]:
             code = error.response.status_code
         if code == 401 and get_token() is None:  # so the Hub answers where there is nothing, or it is private
             code = 404
-        lines = str(error).replace(get_token() or "<token>", "<token>").strip().splitlines()
-        why = lines[-1][:160] if lines else type(error).__name__
+        text = str(error).replace(get_token() or "<token>", "<token>")
+        why = last_exception(text)[:160] or type(error).__name__
         hint = STATUS.get(code) or f"the Hub, the network or this disk does not work ({why}); {AGAIN}"
         raise InputError("repo_id", repo_id, hint) from None  # the client's own words may hold a header
 
@@ -133,22 +132,21 @@ def stage(config: PushConfig, folder: Path, artifact: str) -> Files:
 
 def _point_at_backbone(files: Files, folder: Path) -> None:
     """Makes a policy name the backbone beside it instead of one elsewhere on this machine."""
-    config = read_json(folder / CONFIG)
-    processor = read_json(folder / layout.PREPROCESSOR)
-    for fields, key, place in layout.places_of_names(config, processor):
-        named = fields.get(key) or ""
-        if not Path(named).is_absolute():
-            continue
-        if not (folder / place).is_dir():
-            hint = f"put a copy into {layout.BACKBONE}/ beside {CONFIG}"
-            raise InputError("path", str(folder), f"it needs {named}, which is not in it; {hint}")
-        fields[key] = place
-        files[CONFIG] = _as_json(config)
-        files[layout.PREPROCESSOR] = _as_json(processor)
+    for name in layout.NAMING_BACKBONE:
+        content = read_json(folder / name)
+        for fields, key, place in layout.places_of_names(content):
+            named = fields.get(key) or ""
+            if not Path(named).is_absolute():
+                continue
+            if not (folder / place).is_dir():
+                hint = f"put a copy into {layout.BACKBONE}/ beside {name}"
+                raise InputError("path", str(folder), f"it needs {named}, which is not in it; {hint}")
+            fields[key] = place
+            files[name] = _as_json(content)
 
 
 def without_paths(name: str, content: Path | bytes) -> Path | bytes:
-    """A JSON or YAML file without paths of this machine, as bytes; any other file as it is.
+    """The content of a JSON or YAML file without paths of this machine; any other file as it is.
 
     Of a path only the last name is kept. Vocabularies may hold any text.
     """
@@ -200,11 +198,8 @@ def _upload(config: PushConfig, artifact: str, files: Files) -> dict[str, Any]:
     repo_id = config.repo_id
     repo_type = "dataset" if artifact == DATASET else "model"
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type}
-    try:
-        before = api.repo_info(**where)
-    except RepositoryNotFoundError:
-        api.create_repo(**where, private=config.private)
-        before = api.repo_info(**where)
+    api.create_repo(**where, private=config.private, exist_ok=True)
+    before = api.repo_info(**where)
     if config.private and before.private is False:
         hint = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, hint)

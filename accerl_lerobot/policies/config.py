@@ -127,7 +127,7 @@ class PolicyConfig(Section, section="policy"):
     """Local checkpoint directory or Hub id (``lerobot/smolvla_base``). None: the run's own SFT makes it."""
     revision: str | None = None
     """Hub revision."""
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    discover_packages_path: str | None = None
     """Package to import that registers the checkpoint's policy type, where that is not one of ours and the
     package is not an installed ``lerobot_policy_*``."""
     trust_remote_code: Commit | None = None

@@ -7,7 +7,6 @@ text of a run that got past the escaping could do nothing. Free of torch.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +28,7 @@ def write_report(config: ReportConfig) -> Path:
 
     output = config.file(NAME)
     runs = [read_run(expanded(name, "runs")) for name in config.runs]
-    now = time.time()
-    page = one_run(runs[0], now) if len(runs) == 1 else comparison(runs, now)
+    page = one_run(runs[0]) if len(runs) == 1 else comparison(runs)
     text = html(page, output.resolve().parent)
     output.write_text(text, encoding="utf-8")
     return output

@@ -25,7 +25,6 @@ from accerl_lerobot.errors import ERROR_LOG, InputError
 from accerl_lerobot.report.read import Record, Run, changed_fields, column, differences, finite, newest
 from accerl_lerobot.timeline import read_timeline
 
-RECENT_S = 120.0
 VIDEO_MB = 20
 FEW = 25  # exploring episodes below which their success says nothing; the first to end are the short ones
 LATE = 20  # updates at the end of a run that tell whether its samples are too old
@@ -137,7 +136,7 @@ def html(page: dict[str, Any], folder: Path) -> str:
     return environment.get_template("page.html").render(**page, version=__version__, video_mb=VIDEO_MB)
 
 
-def one_run(run: Run, now: float) -> dict[str, Any]:
+def one_run(run: Run) -> dict[str, Any]:
     """Values of a page about one run."""
     bound = None
     with contextlib.suppress(InputError):  # another version, or a package of the user's, may have written it
@@ -174,28 +173,22 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
     ]
     return {
-        "about": f"accerl {verb} · {run.name} · {status(run, now)}",
+        "about": f"accerl {verb} · {run.name} · {status(run)}",
         "title": _headline(run),
         "facts": facts,
-        "warnings": list(warnings(run, now)),
+        "warnings": list(warnings(run)),
         "blocks": blocks,
     }
 
 
-def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
+def comparison(runs: Sequence[Run]) -> dict[str, Any]:
     """Values of a page about several runs. No winner is named."""
-    names = [run.name for run in runs]
-    each = {}
-    for run in runs:
-        name = run.name
-        if names.count(name) > 1:
-            name = str(run.path)
-        each[name] = run
+    each = {str(run.path): run for run in runs}
     rows = []
     notes = []
     for name, run in each.items():
-        rows.append((name, *_facts(run).values(), status(run, now)))
-        notes += [f"{name}: {text}" for text in warnings(run, now)]
+        rows.append((name, *_facts(run).values(), status(run)))
+        notes += [f"{name}: {text}" for text in warnings(run)]
     evaluations = {name: evaluated(run) for name, run in each.items()}
     explored = {name: exploring(run) for name, run in each.items()}
     unlike = differences([run.config for run in runs])
@@ -215,7 +208,7 @@ def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
             rows=[(name, *map(shown, values)) for name, values in unlike],
         ),
     ]
-    finished = sum(run.result is not None for run in runs)
+    finished = sum(bool(run.result) for run in runs)
     return {
         "about": f"accerl report · {finished} of {len(runs)} finished",
         "title": count(len(runs), "training run"),
@@ -225,33 +218,27 @@ def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
     }
 
 
-def status(run: Run, now: float) -> str:
+def status(run: Run) -> str:
     if run.error:
         return "failed"
-    if run.result is not None:
-        return "finished"
-    if now - run.written < RECENT_S:
-        return "still going"
-    return "not finished"
+    return "finished" if run.result else "not finished"
 
 
-def warnings(run: Run, now: float) -> Iterator[str]:
+def warnings(run: Run) -> Iterator[str]:
     """Caveats of a run's numbers: one plain sentence each, none if all is well."""
     if run.error:
         yield f"The run failed: {run.error} The traceback is in {ERROR_LOG}."
-    elif run.result is None:
+    elif not run.result:
         at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
-        yield f"The run is {status(run, now)}: there is no {SUMMARY}. It last wrote at {at}."
-    if run.truncated:
-        yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or crashed."
+        yield f"The run is not finished: there is no {SUMMARY}. It last wrote at {at}."
     for name, what in WARNINGS.items():
         n = newest(run.rollout, name) or newest(run.train, name)
         if n:
             yield f"{n:,.0f} {what}."
-    for evaluation in (*run.before, *run.newest):
+    for evaluation in (run.before, run.newest):
         for note in evaluation.get("notes", ()):
             yield f"Evaluation {evaluation.get('group')}, {note}."
-    if run.result is not None and run.result.get("note"):
+    if run.result.get("note"):
         yield f"While exploring, {run.result['note']}."
     if run.rollout and not finite(run.rollout, "success_exploring").any():
         yield "No exploring episode succeeded: there was nothing to learn from, unless rewards say more."
@@ -280,8 +267,8 @@ def _evaluations(run: Run) -> list[tuple[str, ...]]:
 
 
 def success_of(evaluation: Record) -> str:
-    """Success of an evaluation, or of a task in it, with its interval."""
-    return rate(evaluation["success"], evaluation["ci95"])
+    """Success of an evaluation, or of a task in it, with its interval; a dash where there is none."""
+    return rate(evaluation.get("success"), evaluation.get("ci95"))
 
 
 def exploring(run: Run) -> Series:
@@ -292,12 +279,12 @@ def exploring(run: Run) -> Series:
     """
     steps = column(run.rollout, "env_steps")
     episodes = column(run.rollout, "episodes")
-    for e in run.before:
-        steps = steps - e["steps_mean"] * e["n"]
-        episodes = episodes - e["n"]
-    counts = episodes >= FEW
-    if run.result is not None:  # workers go on during the final evaluation
-        counts &= steps <= run.result.get("env_steps", np.inf)
+    if run.before:
+        n = run.before["n"]
+        steps = steps - run.before["steps_mean"] * n
+        episodes = episodes - n
+    last = run.result.get("env_steps", np.inf)  # workers go on during the final evaluation
+    counts = (episodes >= FEW) & (steps <= last)
     return Series(steps[counts], column(run.rollout, "success_exploring")[counts])
 
 
@@ -327,30 +314,25 @@ def _headline(run: Run) -> str:
         if len(losses):
             ends = f"{number(losses[0])} → {number(losses[-1])}"
         return f"{count(made, 'update')} on recorded episodes: imitation loss {ends}"
-    if run.result is None:
+    if not run.result:
         return f"{made} of {run.section('trainer').get('updates')} updates on {_tasks(run)}"
-    rates = [success_of(evaluation) for evaluation in (*run.before, *run.newest)]
+    rates = [success_of(evaluation) for evaluation in (run.before, run.newest) if evaluation]
     return f"Success on {_tasks(run)}: {' → '.join(rates)}"
 
 
 def _tasks(run: Run) -> str:
     """The run's task, or how many it has."""
-    for evaluation in run.evaluations[-1:]:
-        names = list(evaluation.get("tasks") or ())
-        if names:
-            return str(names[0]) if len(names) == 1 else count(len(names), "task")
+    last = run.evaluations[-1] if run.evaluations else {}
+    names = list(last.get("tasks") or ())
+    if len(names) > 1:
+        return count(len(names), "task")
     env = run.section("env")
-    return str(env.get("task") or env.get("name") or env.get("type"))
+    return str(names[0] if names else env.get("task") or env.get("name") or env.get("type"))
 
 
 def _facts(run: Run) -> dict[str, str]:
     """Numbers at the top of a page, and of a run's row in the table of several."""
-    result = run.result or {}
-    success = {}
-    for name, ends in (("success before", run.before), ("success", run.newest)):
-        success[name] = ABSENT
-        if ends:
-            success[name] = success_of(ends[0])
+    result = run.result
     steps = result.get("env_steps")
     seen = exploring(run).x
     if steps is None and len(seen):
@@ -360,7 +342,8 @@ def _facts(run: Run) -> dict[str, str]:
     if len(lags):
         mean_lag = float(lags.mean())
     return {
-        **success,
+        "success before": success_of(run.before),
+        "success": success_of(run.newest),
         "algorithm": str(run.section("algorithm").get("type")),
         "seed": str(run.config.get("seed")),
         "updates": number(result.get("updates", newest(run.train, "update"))),

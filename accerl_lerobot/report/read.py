@@ -2,13 +2,14 @@
 """The folder of a run of ``accerl train`` or ``accerl offline`` as plain data.
 
 A run that is still going or has crashed has no result file, and the last line of its ``metrics.jsonl`` may be
-incomplete. Both are common and no error.
+incomplete, and is left out. Both are common and no error.
 
 Also the differences of a run's recipe from the defaults and from other runs.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, leaves, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.errors import ERROR_LOG, InputError
+from accerl_lerobot.errors import ERROR_LOG, InputError, in_one_line
 from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
@@ -39,8 +40,7 @@ class Run:
     train: list[Record]  # records of the trainer
     rollout: list[Record]  # records of all other workers
     evaluations: list[Record]  # in the order of the policy's experience
-    result: Record | None  # summary.json; None: not finished
-    truncated: bool
+    result: Record  # summary.json; empty: not finished
     written: float
     error: str  # last line of its error.log, if nothing was written since; empty: it has not failed
     videos: tuple[Path, ...]
@@ -55,14 +55,14 @@ class Run:
         return "env" not in self.config
 
     @property
-    def before(self) -> list[Record]:
-        """Evaluations before training."""
-        return [e for e in self.evaluations if e.get("group") == "before"]
+    def before(self) -> Record:
+        """The evaluation before training; empty if there is none."""
+        return next((e for e in self.evaluations if e.get("group") == "before"), {})
 
     @property
-    def newest(self) -> list[Record]:
-        """The newest evaluation, unless it is the one before training."""
-        return [e for e in self.evaluations[-1:] if e.get("group") != "before"]
+    def newest(self) -> Record:
+        """The newest evaluation, unless it is the one before training; empty if there is none."""
+        return next((e for e in self.evaluations[-1:] if e.get("group") != "before"), {})
 
     def section(self, name: str) -> Record:
         """Section of its config; empty if another version wrote it without."""
@@ -81,10 +81,8 @@ def read_run(path: Path) -> Run:
     config = read_recipe(config_path) if config_path.is_file() else {}
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: there is no {CONFIG} of accerl train")
-    records, truncated = _records(path / METRICS)
-    result = None
-    if summary.is_file():
-        result = read_json(summary, source)
+    records = _records(path / METRICS, source)
+    result = read_json(summary, source) if summary.is_file() else {}
     parts = (path / name for name in (CONFIG, METRICS, SUMMARY, CHECKPOINTS))  # what the run itself writes
     written = max(part.stat().st_mtime for part in parts if part.exists())
     error = ""
@@ -98,29 +96,31 @@ def read_run(path: Path) -> Run:
         rollout=records.get("rollout", []),
         evaluations=sorted(records.get("evaluation", []), key=lambda e: float(e["env_steps"])),
         result=result,
-        truncated=truncated,
         written=written,
         error=error,
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
 
 
-def _records(path: Path) -> tuple[dict[str, list[Record]], bool]:
-    """Records by their kind, and True if the last line is incomplete, which is left out."""
+def _records(path: Path, source: FileSource) -> dict[str, list[Record]]:
+    """Records by their kind, those of complete lines."""
     records: dict[str, list[Record]] = {}
     if not path.is_file():
-        return records, False
-    *lines, rest = path.read_bytes().split(b"\n")
-    for text in lines:
-        record = json.loads(text)
-        records.setdefault(record["kind"], []).append(record)
-    return records, bool(rest)
+        return records
+    lines = path.read_bytes().split(b"\n")[:-1]
+    for number, text in enumerate(lines, start=1):
+        try:
+            record = json.loads(text)
+            records.setdefault(record["kind"], []).append(record)
+        except (ValueError, KeyError, TypeError) as error:
+            why = f"line {number} is no record ({in_one_line(error)}); remove it"
+            raise source.refuse(path.name, why) from error
+    return records
 
 
 def column(records: Sequence[Record], name: str) -> np.ndarray:
-    """One number of each record, float64; NaN where it is missing or not a number."""
-    values = [record.get(name) for record in records]
-    return np.array([v if isinstance(v, (int, float)) else np.nan for v in values], dtype=np.float64)
+    """One number of each record, float64; NaN where it is missing."""
+    return np.array([record.get(name) for record in records], dtype=np.float64)
 
 
 def finite(records: Sequence[Record], name: str) -> np.ndarray:
@@ -140,11 +140,8 @@ def newest(records: Sequence[Record], name: str) -> float | None:
 def differences(trees: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Any]]]:
     """Fields in which configs differ, with the value of each; a dash where one does not have it."""
     flats = [dict(leaves(tree)) for tree in trees]
-    names: dict[str, Any] = {}
-    for fields in flats:
-        names |= fields
     rows = []
-    for name in names:
+    for name in dict.fromkeys(itertools.chain(*flats)):
         values = [fields.get(name, ABSENT) for fields in flats]
         if name not in PLACES and any(value != values[0] for value in values):
             rows.append((name, values))

@@ -367,8 +367,13 @@ def check_sft_policy(config: SFTConfig) -> Any:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
-        *_, reason = causes(error)
-        raise InputError("sft.policy", fields, f"LeRobot says: {error} {reason}") from error
+        chain: list[Any] = list(causes(error))
+        hint = f"LeRobot says: {chain[-1]}"
+        for link in chain:
+            if getattr(link, "key_path", ()):
+                name = link.key_path[0]
+                raise InputError(f"sft.policy.{name}", fields.get(name), hint) from error
+        raise InputError("sft.policy", fields, hint) from error
 
 
 def sft_policy(config: SFTConfig) -> Any:

@@ -30,7 +30,7 @@ class StateModelConfig(Section, draccus.ChoiceRegistry, section="world_model"):
     make: ClassVar[str]
     """``module:name`` of the class, which is built from a `states.StateSpec` and this config."""
 
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    discover_packages_path: str | None = None
     """Package to import that registers ``world_model.type``, where that is not one of ours."""
 
     type = registered_name
@@ -127,7 +127,7 @@ class WorldModelConfig(Section, section="world_model"):
     """A pixel world model and its training. The default has 2 million weights and trains on two cores."""
 
     model: LearnableModelConfig = field(default_factory=PixelModelConfig)
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    discover_packages_path: str | None = None
     """Package to import that registers the type of `model`, where that is not one of ours."""
     steps: Annotated[int, Range("[1, 1000000000]")] = 4000
     """Gradient steps of the pre-training."""

@@ -13,7 +13,7 @@ import yaml
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import Files, PullConfig, PushConfig, recognise, run_files
 from accerl_lerobot.hub.transfer import stage, without_paths
-from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
+from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "x"}}
@@ -117,15 +117,6 @@ def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
         stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
 
 
-def test_a_linked_file_of_a_run_is_not_pushed(tmp_path: Path):
-    write_json(tmp_path / "secret.json", SUMMARY)
-    run = write_run_folder(tmp_path / "run")
-    (run / "summary.json").unlink()
-    (run / "summary.json").symlink_to(tmp_path / "secret.json")
-    with pytest.raises(InputError, match="summary.json: a link that leads out"):
-        run_files(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
-
-
 def test_a_backbone_is_named_by_its_place_beside_the_weights(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy", type="smolvla", vlm_model_name=str(tmp_path / "gone"))
     step = TOKENIZER | {"config": {"tokenizer_name": str(tmp_path / "gone")}}
@@ -193,10 +184,7 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
     assert yaml.safe_load(bytes(data)) == wanted
 
 
-@pytest.mark.parametrize("indent", [None, 1, 4])
-def test_what_has_no_paths_keeps_every_byte(indent: int | None):
-    data = json.dumps(
-        {"b": 1e-5, "a": "é", "url": "http://a/b/c"}, indent=indent, ensure_ascii=False
-    ).encode()
+def test_what_has_no_paths_keeps_every_byte():
+    data = b'{"b":1e-5,\n   "url": "http://a/b/c"}'
     assert without_paths("config.json", data) is data
     assert without_paths("backbone/tokenizer.json", b'["/a/b/c"]') == b'["/a/b/c"]', "a vocabulary"

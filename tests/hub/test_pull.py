@@ -206,18 +206,6 @@ def test_no_place_of_this_machine_is_named(hub, policy, refused, tmp_path, monke
     assert f"{file}: " in (line := refused()) and "is a place on this machine" in line
 
 
-def test_no_place_of_this_machine_is_named_by_a_world_model_or_dataset(hub: HubServer, refused: Refusal):
-    environment = {"spec": {}, "model": {"type": "theirs", "backbone": "/etc/ssl"}}
-    hub.plant(
-        "alice/environment", {"config.json": json.dumps(environment).encode(), "model.safetensors": b"x"}
-    )
-    assert "config.json: backbone: '/etc/ssl' is a place" in refused(name="alice/environment")
-    info = {"codebase_version": "v3.0", "data_path": "../{chunk_index}/{file_index}.parquet"}
-    files = {"meta/info.json": json.dumps(info).encode(), "meta/episodes/x": b"", "data/x": b""}
-    hub.plant("alice/data", files | {"meta/tasks.parquet": b""}, repo_type="dataset")
-    assert "meta/info.json: data_path" in refused(name="alice/data")
-
-
 def test_places_that_nothing_reads_are_no_reason_to_refuse(hub, policy, pulled, tmp_path):
     config = json.loads((policy / "config.json").read_text()) | {"vlm_model_name": "/gone/backbone"}
     elsewhere = {"dataset": {"root": "/data/mine"}, "output_dir": "/data/out"}

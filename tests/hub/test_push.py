@@ -59,14 +59,9 @@ def test_one_commit_that_holds_everything(hub: HubServer, policy: Path, pushed: 
     assert set(files) - {".gitattributes", "README.md"} == {p.name for p in policy.iterdir()}
     assert found["kind"] == "policy" and found["files"] == len(files) - 1
     assert all(files[path.name] == path.read_bytes() for path in policy.iterdir())
-
-
-def test_the_same_again_is_no_commit(hub: HubServer, policy: Path, pushed: Push):
-    first = pushed(policy)
-    uploaded = list(hub.uploaded)
     again = pushed(policy)
-    assert again["commit"] == first["commit"] and again["unchanged"] and not first["unchanged"]
-    assert hub.uploaded == uploaded and len(hub.repo(NAME).commits) == 2
+    assert again["commit"] == found["commit"] and again["unchanged"] and not found["unchanged"]
+    assert len(repo.commits) == 2 and len(hub.uploaded) == 2, "nothing is sent twice"
 
 
 def test_a_cut_upload_leaves_the_repository_as_it_was_and_goes_on(hub, policy, pushed, refused):
