@@ -88,7 +88,7 @@ class LatencyEnvironment(SimulatedEnvironment):
                 observation={**result.observation, "observation.state": state},
                 terminated=False,
                 truncated=True,
-                info={"nonfinite": 1.0},
+                finite=False,
             )
             self._done = True
         _wait(self._delay())

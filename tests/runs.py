@@ -17,7 +17,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, RatioC
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
@@ -119,7 +119,8 @@ def local_engine(
 ) -> LocalEngine:
     """The engine in one process, as a run makes it."""
     local = replace(config, launch=replace(config.launch, engine="local"))
-    return make_engine(local, tasks, history=1, state=state)
+    spec = replace(make_environment(config.env).spec, tasks=tasks)
+    return make_engine(local, spec, history=1, state=state)
 
 
 def trained(config: RunConfig) -> tuple[list[Progress], LocalEngine]:

@@ -82,7 +82,7 @@ def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
 
 
 RULES = [
-    (BackboneConfig, {"patch": 24}, "sft.backbone.patch=24: use a power of 2"),
+    (BackboneConfig, {"patch": 24}, "sft.backbone.patch=24: use "),
     (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),

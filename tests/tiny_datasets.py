@@ -2,7 +2,7 @@
 """Small LeRobotDatasets that fit ``env.type=simulated``, and changes of their files."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import record
-from accerl_lerobot.envs import EnvConfig
+from accerl_lerobot.envs import EnvConfig, make_environment
 
 FPS, STEPS, TASK = 80, 6, "Match the target"
 FRONT, STATE, ACTION = "observation.images.front", "observation.state", "action"
@@ -84,14 +84,17 @@ def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
 def one_process() -> Iterator[None]:
     """Episodes are played in this process, not in new ones that first import everything."""
 
-    @contextmanager
-    def simulators(processes: int, start: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-        start(*arguments)
-        yield SimpleNamespace(submit=lambda work, *given: SimpleNamespace(result=lambda: work(*given)))
-        record.this_environment().close()
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record, "simulators", simulators)
+
+        @contextmanager
+        def pool(*_: Any, initargs: tuple[EnvConfig], **options: Any) -> Iterator[Any]:
+            with closing(make_environment(*initargs)) as environment:
+                patch.setattr(record, "_environment", environment, raising=False)
+                yield SimpleNamespace(
+                    submit=lambda work, *given: SimpleNamespace(result=lambda: work(*given))
+                )
+
+        patch.setattr(record, "ProcessPoolExecutor", pool)
         yield
 
 

@@ -25,7 +25,7 @@ from accerl_lerobot.config.ranges import NewFolder, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, make_environment
+from accerl_lerobot.envs import EnvConfig, Environment, MetaWorldConfig, make_environment
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.replay.journal import EPISODES, JournalEntry, read_journal, whole_episodes
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -117,11 +117,11 @@ def _decision_cost(run: Path) -> float:
     return float(rollout.get("decision_cost", RolloutConfig().decision_cost))
 
 
-def _replay(cost: float, parts: list[JournalEntry]) -> record.Episode | None:
+def _replay(cost: float, environment: Environment, parts: list[JournalEntry]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
     origin = parts[0].origin
     actions = np.concatenate([part.actions for part in parts])
-    episode = record.played(record.this_environment(), origin.task, origin.seed, actions)
+    episode = record.played(environment, origin.task, origin.seed, actions)
     if len(episode) != len(actions) or episode.success != parts[-1].success:
         return None
     steps = np.concatenate([part.steps for part in parts])

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.errors import InputError
@@ -30,13 +30,11 @@ class BackboneConfig(Section, section="sft.backbone"):
 
     hidden: Annotated[int, Range("[8, 4096]")] = 96
     """Width of the language model; a multiple of 8."""
-    patch: Annotated[int, Range("[1, 32]")] = 16
-    """Side of an image patch in pixels; a power of 2."""
+    patch: Literal[1, 2, 4, 8, 16, 32] = 16
+    """Side of an image patch in pixels."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if IMAGE % self.patch:
-            raise InputError("sft.backbone.patch", self.patch, "use a power of 2")
         if self.hidden % 8:  # four heads, which rotary embeddings halve
             raise InputError("sft.backbone.hidden", self.hidden, "use a multiple of 8")
 

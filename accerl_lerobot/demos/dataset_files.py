@@ -49,15 +49,13 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     name = dataset.repo_id
-    root = dataset.root
     if name is None:
         hint = "name a LeRobotDataset; with dataset.root any label will do"
         raise InputError("dataset.repo_id", None, hint)
-    if root is not None:
-        root = str(expanded(root, "dataset.root"))
-        if not (Path(root) / INFO).is_file():
-            raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
-    with _one_line_errors(dataset), checked(origin_of(dataset), whole=root is not None):
+    root = local_folder(dataset)
+    if root is not None and not (Path(root) / INFO).is_file():
+        raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
+    with _one_line_errors(dataset), checked(dataset):
         meta = LeRobotDatasetMetadata(name, root=root, revision=dataset.revision)
     if meta.episodes is None or meta.tasks is None:
         raise origin_of(dataset).refuse(INFO, "it has no episodes, or no tasks; name a dataset that has some")
@@ -74,7 +72,7 @@ def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = N
 
     if episodes is not None:
         episodes = list(episodes)
-    with checked(origin_of(dataset), whole=dataset.root is not None):
+    with checked(dataset):
         with _one_line_errors(dataset):
             # The default backend probes for FFmpeg's libraries, and prints tracebacks where there are none.
             data = LeRobotDataset(
@@ -123,9 +121,17 @@ def another_version(dataset: DatasetConfig) -> InputError:
 
     tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={dataset.repo_id}"
     if dataset.root is not None:
-        tool += f" --root={expanded(dataset.root, 'dataset.root')}"
+        tool += f" --root={local_folder(dataset)}"
     why = f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
-    return InputError("dataset.repo_id", dataset.repo_id, f"{why} --push-to-hub=false")
+    origin = origin_of(dataset)
+    return InputError(origin.field, origin.value, f"{why} --push-to-hub=false")
+
+
+def local_folder(dataset: DatasetConfig) -> str | None:
+    """The folder of a dataset that is not the Hub's."""
+    if dataset.root is None:
+        return None
+    return str(expanded(dataset.root, "dataset.root"))
 
 
 def origin_of(dataset: DatasetConfig) -> FileSource:
@@ -141,26 +147,28 @@ def task_texts(meta: Any) -> list[str]:
 
 
 @contextlib.contextmanager
-def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
+def checked(dataset: DatasetConfig) -> Iterator[None]:
     """In this context LeRobot has a dataset's files checked when it reads them.
 
-    With `whole`, missing files are refused; otherwise LeRobot fetches them.
+    Missing files of a local dataset are refused; those of others LeRobot fetches.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_reader import DatasetReader
 
     from datasets import Image
 
+    origin = origin_of(dataset)
+    local = dataset.root is not None
     load_metadata = LeRobotDatasetMetadata._load_metadata
     try_load = DatasetReader.try_load
     decode = Image.decode_example
 
     def checked_metadata(self: Any) -> None:
-        check_metadata(Path(self.root), origin)
+        check_metadata(Path(self.root), dataset)
         try:
             load_metadata(self)
         except (FileNotFoundError, NotADirectoryError) as error:
-            if whole:
+            if local:
                 raise origin.refuse("meta", f"{error}; give the whole folder") from error
             raise
         if self.tasks is not None:  # LeRobot takes a task's index for the number of its row
@@ -168,7 +176,7 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
 
     def checked_try(self: Any) -> bool:
         found = bool(try_load(self))
-        if whole and not found:
+        if local and not found:
             raise origin.refuse(DATA, "files of some episodes are missing; give the whole folder")
         return found
 
@@ -190,21 +198,17 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
         yield
 
 
-def check_metadata(root: Path, origin: FileSource) -> None:
-    """Refuse metadata of an old version, or that would have LeRobot read outside the folder.
-
-    Raises:
-        CompatibilityError: LeRobot's, of an old version.
-    """
+def check_metadata(root: Path, dataset: DatasetConfig) -> None:
+    """Refuse metadata of an old version, or that would have LeRobot read outside the folder."""
     import pyarrow.parquet as pq
-    from lerobot.datasets.utils import CompatibilityError
 
     if not (root / INFO).exists():
         return  # LeRobot fetches it
+    origin = origin_of(dataset)
     check_folder(root, origin)
     info = read_json(root / INFO, origin)
     if OLD_VERSION.match(str(info.get("codebase_version"))):
-        raise CompatibilityError
+        raise another_version(dataset)
     for key in ("data_path", "video_path"):
         template = str(info.get(key) or "-")
         example = PLACE.sub("0", template)
@@ -245,32 +249,32 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
     """
     origin = origin_of(dataset)
     texts = task_texts(data.meta)
-    read = ("episode_index", "frame_index", "task_index", REWARD, SUCCESS)
-    columns = {name: numbers(data, name, dataset).ravel() for name in read if name in data.meta.features}
-    episode = columns["episode_index"]
-    order = np.lexsort((columns["frame_index"], episode))
-    ends = np.flatnonzero(np.diff(episode[order])) + 1
+    labels = [name for name in (REWARD, SUCCESS) if name in data.meta.features]
+    for name in labels:
+        numbers(data, name, dataset)  # refuses what is not finite
+    table = data.hf_dataset.select_columns(
+        ["episode_index", "frame_index", "task_index", *labels]
+    ).to_pandas()
     found = []
-    for rows in np.split(order, ends):
-        own = {name: values[rows] for name, values in columns.items()}
-        index = int(episode[rows[0]])
-        tasks = tuple(texts[number] for number in dict.fromkeys(own["task_index"].tolist()))
+    for index, own in table.sort_values(["episode_index", "frame_index"]).groupby("episode_index"):
+        tasks = tuple(texts[number] for number in own["task_index"].unique())
         if one_task and len(tasks) > 1:
             hint = f"its instruction changes from {tasks[0]!r} to {tasks[1]!r}, and one is read here"
             raise origin.refuse(f"episode {index}", f"{hint}; split the episode, or use accerl sft")
         success_at = None
-        rewards = own.get(REWARD)
+        rewards = None
+        if REWARD in own:
+            rewards = own[REWARD].to_numpy(np.float32)
         if SUCCESS in own:
-            success_at = step_of_success(own[SUCCESS])
+            success_at = step_of_success(own[SUCCESS].to_numpy())
         elif rewards is not None:
             success_at = step_of_reward(rewards)
             if success_at is None:
                 hint = f"{REWARD} is above 0 at steps that do not end it, so that it tells no success"
                 raise origin.refuse(f"episode {index}", f"{hint}; {LABEL}")
-        if rewards is not None:
-            rewards = rewards.astype(np.float32)
+        rows = own.index.to_numpy()
         found.append(
-            EpisodeLabels(index=index, rows=rows, tasks=tasks, rewards=rewards, success_at=success_at)
+            EpisodeLabels(index=int(index), rows=rows, tasks=tasks, rewards=rewards, success_at=success_at)
         )
     return found
 

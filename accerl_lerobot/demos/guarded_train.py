@@ -24,7 +24,7 @@ from torch.utils.data import Dataset
 from accerl_lerobot import errors
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import checked, origin_of
+from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import ANSWER, TRUST
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.untrusted import guarded
@@ -113,8 +113,7 @@ def main() -> None:
     from accerl_lerobot.policies.vla import data_only
 
     commit = _argument(TRUST)
-    root = _argument("--dataset.root=")
-    dataset = DatasetConfig(repo_id=_argument("--dataset.repo_id="), root=root)
+    dataset = DatasetConfig(repo_id=_argument("--dataset.repo_id="), root=_argument("--dataset.root="))
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
     DatasetReader._query_hf_dataset = query_rows
     discover(_argument(PACKAGE), "policy")
@@ -123,7 +122,7 @@ def main() -> None:
     errors.collect_warnings()
     tokenisers = data_only() if commit is None else contextlib.nullcontext()
     try:
-        with guarded("sft", commit), checked(origin_of(dataset), whole=root is not None), tokenisers:
+        with guarded("sft", commit), checked(dataset), tokenisers:
             lerobot_train.main()
     except Exception as error:
         answer = errors.error_as_json(error)

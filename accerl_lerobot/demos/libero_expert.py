@@ -8,7 +8,6 @@ again. Positions are in metres in the world's frame, rotations in radians.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -56,6 +55,8 @@ KNOB = 0.038  # height of the grasp above the origin of the stove's knob
 PRESS = 0.008  # height of the fingers above a plate's origin while they push it
 WIDEST = 0.068  # widest object that fits between the open fingers with some room, in m
 DEPTH = 0.015  # distance of the grip site below an object's top; the palm is 2.4 cm above the grip site
+MARGIN = 0.004  # distance at which a point counts as inside an object, in m
+CLEARANCE = 0.08  # distance of objects beside the hand's way that it rises above, in m
 EASY_REACH = 0.72  # distance from the robot's base that a hand pointing straight down reaches easily, in m
 DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Rotation of a hand that points down; its fingers close along the world's y axis."""
@@ -104,12 +105,12 @@ class Scene:
         turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
         return corners @ turn.transpose(0, 2, 1) + data.geom_xpos[geoms][:, None]
 
-    def collisions(self, name: str, points: np.ndarray, margin: float = 0.004) -> np.ndarray:
+    def collisions(self, name: str, points: np.ndarray) -> np.ndarray:
         """Number of points (..., P, 3) that are inside an object other than `name`, int (...)."""
         model = self.simulator.model
         data = self.simulator.data
         centre = points.reshape(-1, 3).mean(0)
-        spread = norm(points - centre, axis=-1).max() + margin
+        spread = norm(points - centre, axis=-1).max() + MARGIN
         inside = np.zeros(points.shape[:-1], bool)
         for geom in self._geoms(name, others=True):
             position = data.geom_xpos[geom]
@@ -119,18 +120,18 @@ class Scene:
                 continue
             turn = data.geom_xmat[geom].reshape(3, 3)
             local = (points - position) @ turn - middle
-            inside |= (np.abs(local) < half + margin).all(-1)
+            inside |= (np.abs(local) < half + MARGIN).all(-1)
         return inside.sum(-1)
 
-    def height(self, name: str, start: np.ndarray, goal: np.ndarray, margin: float = 0.08) -> float:
-        """Highest point of the objects that are, seen from above, within `margin` of a line."""
+    def height(self, name: str, start: np.ndarray, goal: np.ndarray) -> float:
+        """Highest point of the objects that are, seen from above, within `CLEARANCE` of a line."""
         corners = self.corners(name, others=True)
         low = corners.min(1)
         high = corners.max(1)
         shares = np.linspace(0, 1, 12)[:, None, None]
         line = start[:2] + shares * (goal - start)[:2]
         gap = np.maximum(low[:, :2] - line, line - high[:, :2]).max(-1)
-        near = (gap < margin).any(0)
+        near = (gap < CLEARANCE).any(0)
         lowest = self.corners(name)[..., 2].min()
         return float(high[near, 2].max(initial=lowest))
 
@@ -181,18 +182,15 @@ class Scene:
             cost = np.repeat([1.0, 0.0], len(across))  # the side of −y, if it is free
         points = (flat.min(0) + flat.max(0)) / 2 + offsets
         yaws = np.tile(yaws, len(points) // len(yaws))
-        hands = np.column_stack([points, np.full(len(points), height)])
-        moved = hands + goal - position
-        reach = norm(hands[:, :2] - self.base, axis=-1)
-        reach_moved = norm(moved[:, :2] - self.base, axis=-1)
-        far = np.maximum(np.maximum(reach, reach_moved) - EASY_REACH, 0)
+        hands = np.insert(points, 2, height, axis=1)
+        both_ends = np.stack([hands, hands + goal - position])
+        reach = norm(both_ends[..., :2] - self.base, axis=-1).max(0)
+        far = np.maximum(reach - EASY_REACH, 0)
         leans = np.minimum(3 * far, 0.35)
         grasps = [Grasp(*each) for each in zip(hands - position, yaws, leans, strict=True)]
         turns = np.stack([self.turn(grasp, position) for grasp in grasps])
         spread = hands[:, None] + HAND @ turns.transpose(0, 2, 1)
-        collisions = self.collisions(name, spread)
-        collisions += self.collisions(name, spread + goal - position)
-        cost += collisions
+        cost += self.collisions(name, spread) + self.collisions(name, spread + goal - position)
         cost += 30 * far + 0.7 * np.abs(yaws) + rng.normal(0, 0.3, len(yaws))
         return grasps[np.argmin(cost)]
 
@@ -207,8 +205,7 @@ class Hand:
         self.speed = rng.uniform(0.85, 1)
         self.grip = -1.0
         self.held = np.zeros(3)  # offset of the grasped object from the hand
-        self.turn: Callable[[np.ndarray], np.ndarray] = lambda at: DOWN
-        """Maps the hand's position to its wanted orientation (3, 3)."""
+        self.pose: Grasp | None = None  # gives the wanted orientation; None: straight down
 
     @property
     def position(self) -> np.ndarray:
@@ -229,7 +226,8 @@ class Hand:
     def rotation_error(self) -> Rotation:
         """Rotation from the hand's current orientation to the wanted one."""
         position, rotation = self.simulator.hand
-        return Rotation.from_matrix(self.turn(position) @ rotation.T)
+        wanted = DOWN if self.pose is None else self.scene.turn(self.pose, position)
+        return Rotation.from_matrix(wanted @ rotation.T)
 
     def move(
         self, goal: Goal, within: float = 0.012, steps: int = 60, given: Condition = lambda: True
@@ -282,7 +280,7 @@ class Hand:
                 yield from self.set_grip(-1.0, self.position, 5)
                 yield from self.rise(0.08, 12)
             grasp = known or scene.grasp(name, place(), self.rng)
-            self.turn = partial(scene.turn, grasp)
+            self.pose = grasp
             start = self.position
 
             def goal(offset: np.ndarray = grasp.offset) -> np.ndarray:
@@ -384,6 +382,13 @@ def put_in_microwave(hand: Hand, name: str, region: str) -> Script:
     return (yield from hand.move(lambda: back, within=0.02))
 
 
+def approach(hand: Hand, goal: Goal, height: float) -> Script:
+    """Moves closed fingers to a goal from above."""
+    hand.grip = 1.0
+    yield from hand.over(goal, height)
+    return (yield from hand.move(goal, within=0.02))
+
+
 def close_microwave(hand: Hand, name: str) -> Script:
     """Pushes a microwave's door from outside until it is closed."""
     door = hand.simulator.data.body(f"{name}_microdoorroot")
@@ -392,10 +397,8 @@ def close_microwave(hand: Hand, name: str) -> Script:
         point = [DOOR[0], -distance, DOOR[1] + height]
         return door.xpos + door.xmat.reshape(3, 3) @ point
 
-    hand.grip = 1.0
-    hand.turn = lambda at: DOWN
-    yield from hand.over(lambda: outside(0.1), outside(0, 0.15)[2])
-    yield from hand.move(lambda: outside(0.1), within=0.02)
+    hand.pose = None
+    yield from approach(hand, lambda: outside(0.1), outside(0, 0.15)[2])
     return (yield from hand.move(lambda: outside(-0.06), steps=150))
 
 
@@ -406,8 +409,7 @@ def in_front(hand: Hand, region: str, yaw: float, lean: float) -> Callable[..., 
     drawer = simulator.data.body(f"{cabinet}_cabinet_{level}")
     turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
-    grasp = Grasp(np.zeros(3), yaw, lean, -front[:2])
-    hand.turn = partial(hand.scene.turn, grasp)
+    hand.pose = Grasp(np.zeros(3), yaw, lean, -front[:2])
 
     def handle(ahead: float = 0.0) -> np.ndarray:
         return drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
@@ -437,9 +439,7 @@ def close_drawer(hand: Hand, region: str) -> Script:
     _, rotation = hand.simulator.hand
     yaw = np.copysign(np.pi / 2, -rotation[0, 0])  # the one that needs the smaller turn
     handle = in_front(hand, region, yaw, 0.8)
-    hand.grip = 1.0
-    yield from hand.over(lambda: handle(0.06), handle()[2] + 0.15)
-    yield from hand.move(lambda: handle(0.06), within=0.02)
+    yield from approach(hand, lambda: handle(0.06), handle()[2] + 0.15)
     return (yield from hand.move(lambda: handle(-0.05), steps=80))
 
 
@@ -450,8 +450,7 @@ def turn_knob(hand: Hand, name: str) -> Script:
 
     def turn_by(angle: float) -> None:
         yaw = simulator.opening(name) + angle
-        grasp = Grasp(np.zeros(3), yaw, 0.0)
-        hand.turn = partial(hand.scene.turn, grasp)
+        hand.pose = Grasp(np.zeros(3), yaw, 0.0)
 
     turn_by(0.0)
     yield from hand.move(lambda: knob + [0, 0, 0.08])
@@ -488,11 +487,12 @@ PLANS = {
 """Predicates of LIBERO's that a task needs, in the order of work, where its goal alone does not tell them."""
 
 
-def script(simulator: Simulator, task: str) -> Script:
+def script(environment: LiberoEnvironment, task: str) -> Script:
     """The script of an episode, which works at the first predicate that is not true yet.
 
-    Equal starts give equal scripts.
+    It begins at its first action, when the episode has begun. Equal starts give equal scripts.
     """
+    simulator: Simulator = environment.simulator
     rng = np.random.default_rng(simulator.data.qpos.view(np.uint32))
     hand = Hand(Scene(simulator), rng)
     plan = PLANS.get(task, simulator.env.parsed_problem["goal_state"])
@@ -504,7 +504,7 @@ def script(simulator: Simulator, task: str) -> Script:
 
 
 def libero_expert(environment: Environment, task: str) -> Callable[[], np.ndarray]:
-    """The expert of a task; it plans at its first call, when the episode has begun.
+    """The expert of a task.
 
     Raises:
         InputError: there is none for this task.
@@ -513,11 +513,5 @@ def libero_expert(environment: Environment, task: str) -> Callable[[], np.ndarra
     if task.split("/")[0] not in SUITES or task == UNSOLVED:
         known = f"{', '.join(SUITES)}, except {UNSOLVED}"
         raise InputError("env.task", task, f"scripted experts exist for {known}; name other tasks")
-    actions: list[Script] = []
-
-    def act() -> np.ndarray:
-        if not actions:
-            actions.append(script(environment.simulator, task))
-        return next(actions[0])
-
-    return act
+    actions = script(environment, task)
+    return lambda: next(actions)

@@ -16,7 +16,7 @@ import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -34,15 +34,7 @@ from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, EnvironmentSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
-from accerl_lerobot.errors import (
-    ChildWarning,
-    InputError,
-    check_absent,
-    collect_warnings,
-    collected_warnings,
-    expanded,
-    show_warnings,
-)
+from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
 from accerl_lerobot.seeds import demo_seed
 
@@ -150,6 +142,8 @@ def metaworld_expert(environment: Environment, task: str) -> Expert:
     from metaworld import policies
 
     assert isinstance(environment, MetaWorld)
+    # Its gains are too high on purpose, and `disturbed` clips.
+    warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
     policy = getattr(policies, expert_name(task))()
     return lambda: policy.get_action(environment.simulator.everything())
 
@@ -189,39 +183,12 @@ def appearing(root: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def simulators(processes: int, start: Callable[..., None], *arguments: Any) -> Iterator[ProcessPoolExecutor]:
-    """So many processes, each made ready by `start`; an error inside ends them at once."""
-    context = multiprocessing.get_context("spawn")
-    before = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(processes, context, initializer=_ready, initargs=(start, *arguments)) as pool:
-        try:
-            yield pool
-        except BaseException:
-            for process in set(multiprocessing.active_children()) - before:
-                process.kill()
-            raise
-
-
-def _ready(start: Callable[..., None], *arguments: Any) -> None:
-    """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    collect_warnings()
-    start(*arguments)
-
-
-def _with_warnings[Item, Result](
-    work: Callable[[Item], Result], item: Item
-) -> tuple[Result, list[ChildWarning]]:
-    return work(item), collected_warnings()
-
-
-@contextmanager
 def simulated[Item, Result](
-    env_config: EnvConfig, work: Callable[[Item], Result], items: Sequence[Item]
+    env_config: EnvConfig, work: Callable[[Environment, Item], Result], items: Sequence[Item]
 ) -> Iterator[Iterator[Result]]:
-    """Results of `work`, in the order of `items`, from processes that have each a `this_environment`.
+    """Results of `work(environment, item)`, in the order of `items`, from processes with an environment each.
 
-    Few finished ones wait in memory.
+    Few finished ones wait in memory. An error inside ends the processes at once.
     """
     # Each process comes to hold a simulator of every task.
     tasks = getattr(env_config, "tasks", ("one",))
@@ -229,37 +196,39 @@ def simulated[Item, Result](
     fitting = free_memory_gib() / each
     cores = len(os.sched_getaffinity(0))
     processes = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting)))
-    with simulators(processes, _open_environment, env_config) as pool:
-
-        def finished(work: Any) -> Result:
-            result, warned = work.result()
-            show_warnings(warned)
-            return result
+    before = set(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, initializer=_start, initargs=(env_config,)) as pool:
 
         def results() -> Iterator[Result]:
-            waiting: deque[Any] = deque()
+            waiting: deque[Future[Result]] = deque()
             for item in items:
-                waiting.append(pool.submit(_with_warnings, work, item))
+                waiting.append(pool.submit(_worked, work, item))
                 if len(waiting) > 2 * processes:
-                    yield finished(waiting.popleft())
-            yield from map(finished, waiting)
+                    yield waiting.popleft().result()
+            for future in waiting:
+                yield future.result()
 
-        yield results()
+        try:
+            yield results()
+        except BaseException:
+            for process in set(multiprocessing.active_children()) - before:
+                process.kill()
+            raise
+
+
+def _worked[Item, Result](work: Callable[[Environment, Item], Result], item: Item) -> Result:
+    return work(_environment, item)
 
 
 _environment: Environment
 
 
-def _open_environment(env_config: EnvConfig) -> None:
+def _start(env_config: EnvConfig) -> None:
+    """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
     global _environment
-    # The experts' gains are too high on purpose, and `disturbed` clips.
-    warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _environment = make_environment(env_config)
-
-
-def this_environment() -> Environment:
-    """The environment that a process of `simulated` has for all its episodes."""
-    return _environment
 
 
 @contextmanager
@@ -278,7 +247,7 @@ def new_dataset(
     dataset = LeRobotDataset.create(
         repo_id,
         fps=spec.fps,
-        features=features(spec, env_config.state_size) | dict(more or {}),
+        features=features(spec) | dict(more or {}),
         root=root,
         robot_type=env_config.type,
         use_videos=False,
@@ -360,18 +329,15 @@ def save_episode(
     tally["successes"] += episode.success
 
 
-def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[str, Any]]:
-    """LeRobot's feature table for an environment; reward, done and success under LeRobot's own names.
-
-    `environment_state` is the size of its ``observation.environment_state``; 0: it offers none.
-    """
+def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
+    """LeRobot's feature table for an environment; reward, done and success under LeRobot's own names."""
     table: dict[str, dict[str, Any]] = {
         key: {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
         for key, shape in spec.images.items()
     }
     vectors = {"observation.state": spec.state_dim, "action": spec.action_dim, REWARD: 1}
-    if environment_state:
-        vectors[ENVIRONMENT_STATE] = environment_state
+    if spec.environment_state_dim:
+        vectors[ENVIRONMENT_STATE] = spec.environment_state_dim
     for key, size in vectors.items():
         table[key] = {"dtype": "float32", "shape": (size,), "names": None}
     for key in ("next.done", SUCCESS):
@@ -379,9 +345,10 @@ def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[st
     return table
 
 
-def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> Episode:
+def record_one(
+    env_config: EnvConfig, config: DemosConfig, seed: int, environment: Environment, slot: int
+) -> Episode:
     """The episode at place `slot` of the dataset."""
-    environment = this_environment()
     tasks = environment.spec.tasks
     share = config.failure_share
     task = tasks[slot % len(tasks)]

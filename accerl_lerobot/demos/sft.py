@@ -27,7 +27,8 @@ from accerl_lerobot.checkpoint.safety import FileSource, read_json
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
-from accerl_lerobot.errors import InputError, check_absent, expanded, last_exception
+from accerl_lerobot.demos.dataset_files import local_folder, open_metadata, opened, read_labels
+from accerl_lerobot.errors import InputError, check_absent, last_exception
 from accerl_lerobot.experience import REWARD, SUCCESS
 from accerl_lerobot.policies.config import check_registered, discovery, register_policies
 
@@ -116,10 +117,12 @@ def sft_command(
     }
     policy |= {"device": device, "push_to_hub": False}
     policy |= {name: value for name, value in preset.items() if name in known}
-    root = dataset.root
-    if root is not None:
-        root = str(expanded(root, "dataset.root"))
-    data = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision, "episodes": episodes}
+    data = {
+        "repo_id": dataset.repo_id,
+        "root": local_folder(dataset),
+        "revision": dataset.revision,
+        "episodes": episodes,
+    }
     flags = {f"policy.{name}": value for name, value in policy.items()}
     flags |= {f"dataset.{name}": value for name, value in data.items() if value is not None}
     flags |= {
@@ -241,8 +244,6 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     """
     if pick == "all":
         return None
-    from accerl_lerobot.demos.dataset_files import open_metadata, opened, read_labels
-
     meta = open_metadata(dataset)
     if not {SUCCESS, REWARD} & set(meta.features):
         hint = f"the dataset's episodes are not labelled by {SUCCESS} or {REWARD}; use all"

@@ -102,11 +102,9 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
         if value in (metadata(package).get_all("Provides-Extra") or ()):
             hint += f"; pip install '{package}[{value}]'"
         return InputError(field, value, hint)
-    hint = f"the environment fails ({in_one_line(error)}); ACCERL_LOG=DEBUG shows where"
-    kwargs = getattr(config, "kwargs", None)
-    if kwargs:
-        return InputError("env.kwargs", kwargs, f"{value}: {hint}")
-    return InputError(field, value, hint)
+    return InputError(
+        field, value, f"the environment fails ({in_one_line(error)}); ACCERL_LOG=DEBUG shows where"
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -179,7 +177,7 @@ class JudgedEnvironment(WrappedEnvironment):
         if self._history > 1:
             arrays = {name: value for name, value in newest.items() if isinstance(value, np.ndarray)}
             newest |= {name: value[-1] for name, value in arrays.items()}
-        success = not result.info.get("nonfinite") and self.succeeded(newest)
+        success = result.finite and self.succeeded(newest)
         rewards = np.zeros_like(result.rewards)
         rewards[-1] = success
         return replace(

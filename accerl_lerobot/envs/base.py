@@ -34,6 +34,7 @@ class EnvironmentSpec:
 
     images: dict[str, tuple[int, int, int]]  # ``observation.images.<camera>`` → (H, W, 3)
     state_dim: int  # length of ``observation.state``
+    environment_state_dim: int = 0  # length of ``observation.environment_state``; 0: observations have none
     action_dim: int
     action_low: np.ndarray  # float32 (A,). Actions outside are clipped by the environment.
     action_high: np.ndarray
@@ -55,7 +56,7 @@ class ChunkResult:
     truncated: bool
     success: bool  # True if the task has been achieved at any step of the episode so far
     note: str = ""  # at the end of an episode: why its success may not be what happened
-    info: dict[str, float] = field(default_factory=dict)
+    finite: bool = True  # False if the simulator diverged: the episode must not be trained on
 
     @property
     def steps(self) -> int:
@@ -113,8 +114,7 @@ class Step(NamedTuple):
     ended: bool  # True if the task is over, which `success` alone need not mean
     reward: float | None = None  # None: 1.0 at the first success, else 0.0
     cut: bool = False  # True if the simulator itself ends the episode early
-    finite: bool = True
-    """False if the simulator diverged: the episode ends as truncated, and must not be trained on."""
+    finite: bool = True  # see `ChunkResult.finite`
 
 
 class EpisodeEnvironment(Environment):
@@ -162,35 +162,31 @@ class EpisodeEnvironment(Environment):
         for action in checked_actions(actions, self.spec):
             step = self._step(action)
             self._steps += 1
-            succeeded = step.success and step.finite
             reward = step.reward
             if reward is None:
-                reward = float(succeeded and not self._success)
+                reward = float(step.success and not self._success)
             rewards.append(reward)
-            self._success |= succeeded
-            terminated = step.ended and step.finite
-            limit = self._steps >= self.spec.max_steps
-            truncated = not terminated and (step.cut or limit or not step.finite)
-            self._done = terminated or truncated
+            self._success |= step.success
+            late = self._steps >= self.spec.max_steps
+            self._done = step.ended or step.cut or late
             if self._done:
                 break
         return ChunkResult(
             observation=self._observe(),
             rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
+            terminated=step.ended,
+            truncated=self._done and not step.ended,
             success=self._success,
-            info={} if step.finite else {"nonfinite": 1.0},
+            finite=step.finite,
         )
 
 
 def checked_actions(actions: np.ndarray, spec: EnvironmentSpec) -> np.ndarray:
     """The chunk as float32 within the environment's bounds; refuses other shapes than (K ≥ 1, A), and NaN."""
     actions = np.asarray(actions, np.float32)
-    if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
-        raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
-    if not np.isfinite(actions).all():
-        raise ValueError("actions hold a non-finite value")
+    fit = actions.size and actions.shape[1:] == (spec.action_dim,)
+    if not fit or not np.isfinite(actions).all():
+        raise ValueError(f"actions {actions.shape} are not finite or not (K >= 1, {spec.action_dim})")
     return np.clip(actions, spec.action_low, spec.action_high)
 
 
@@ -224,22 +220,12 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
         """True if observations hold ``observation.environment_state``."""
         return bool(getattr(self, "environment_state", None))
 
-    @property
-    def state_size(self) -> int:
-        """Numbers of ``observation.environment_state``; 0 where observations hold none."""
-        return 0
-
     def nominal(self) -> Self:
         """This config without deployment shift; an environment that has one overrides it."""
         return self
 
 
 IS_SUCCESS = "is_success"  # LeRobot's key of ``info``
-
-
-def names(text: str) -> tuple[str, ...]:
-    """Names separated by commas."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
@@ -268,8 +254,6 @@ class SuiteConfig(EnvConfig):
 
     groups: ClassVar[Callable[[], Mapping[str, Sequence[str]]]]
     """Tasks of each group that `task` may name."""
-    STATE_NUMBERS: ClassVar[int]
-    """Numbers of ``observation.environment_state`` that are the simulator's."""
     CAMERAS: ClassVar[tuple[str, ...]]
     """Names that `camera` may have."""
 
@@ -281,8 +265,8 @@ class SuiteConfig(EnvConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         expand_tasks(self.task, type(self).groups())
-        cameras = set(self.cameras)
-        if not cameras or len(cameras) < len(self.cameras) or not cameras <= set(self.CAMERAS):
+        known = set(self.cameras) & set(self.CAMERAS)
+        if len(known) < len(self.cameras):
             hint = f"name each camera once, separated by commas, of: {', '.join(self.CAMERAS)}"
             raise InputError("env.camera", self.camera, hint)
 
@@ -294,22 +278,27 @@ class SuiteConfig(EnvConfig):
     @property
     def cameras(self) -> tuple[str, ...]:
         """The camera names that `camera` stands for."""
-        return names(self.camera)
-
-    @property
-    def state_size(self) -> int:
-        if not self.environment_state:
-            return 0
-        return self.STATE_NUMBERS + 1
+        return tuple(name.strip() for name in self.camera.split(","))
 
 
 def unit_spec(
-    config: Any, images: Iterable[str], instruction: Callable[[str], str], state: int, action: int, fps: int
+    config: Any,
+    images: Iterable[str],
+    instruction: Callable[[str], str],
+    *,
+    state: int,
+    environment_state: int,
+    action: int,
+    fps: int,
 ) -> EnvironmentSpec:
-    """Spec of an environment whose images are squares and whose actions lie in [−1, 1]."""
+    """Spec of an environment whose images are squares and whose actions lie in [−1, 1].
+
+    `environment_state` is the length of ``observation.environment_state`` without the share of time gone.
+    """
     return EnvironmentSpec(
         images=dict.fromkeys(images, (config.image_size, config.image_size, 3)),
         state_dim=state,
+        environment_state_dim=environment_state + 1 if config.environment_state else 0,
         action_dim=action,
         action_low=np.full(action, -1, np.float32),
         action_high=np.full(action, 1, np.float32),
@@ -357,11 +346,10 @@ class SuiteEnvironment(EpisodeEnvironment):
 
     def _step(self, action: np.ndarray) -> Step:
         success, finite = self.simulator.step(action)
-        return Step(success=success, ended=success, finite=finite)
+        solved = success and finite
+        return Step(success=solved, ended=solved, cut=not finite, finite=finite)
 
     def render(self, height: int, width: int) -> np.ndarray:
-        if self.simulator is None:
-            raise RuntimeError("nothing to render: call reset first")
         return np.asarray(self.simulator.render(self.config.cameras[0], height, width))
 
     def close(self) -> None:

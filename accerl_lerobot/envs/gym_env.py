@@ -10,10 +10,8 @@ Importing this file loads neither Gymnasium nor LeRobot; making the environment 
 from __future__ import annotations
 
 import contextlib
-import functools
 import io
 import re
-from abc import abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -35,6 +33,7 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 FPS = 20  # control rate of environments that name none
 MAX_STEPS = 500  # episode limit of environments that have none
+LIMIT = "_max_episode_steps"  # attribute of an environment or a wrapper of it, where LeRobot reads the limit
 RENDER = "render"  # in `GymConfig.images`: the picture that the environment renders
 RETURNS = {
     "reset": ("observation", "info"),
@@ -51,10 +50,13 @@ class GymnasiumConfig(EnvConfig):
     """Base of the configs of environments of Gymnasium's interface."""
 
     max_steps: Annotated[int, Range("[0, 1000000]")] = 0
-    """Episode limit in env steps; reaching it truncates. 0: the environment's own, or 500 if it has none."""
+    """Episode limit in env steps; reaching it truncates. 0: the environment's own, or 500 if it has none. One
+    of LeRobot's without ``episode_length`` keeps its own as well."""
     success: str = IS_SUCCESS
     """Key of the environment's ``info`` that is true once the task is achieved, nested ones joined by dots;
     empty: its ``terminated``."""
+    task: str = ""
+    """Instruction text, for environments that have none of their own."""
     reward: Literal["success", "env"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
 
@@ -66,39 +68,40 @@ class GymnasiumEnvironment(EpisodeEnvironment):
     ends_at_success: ClassVar[bool]
     """True if the first success ends an episode; otherwise the environment alone ends it."""
 
-    def __init__(self, environments: dict[str, Any]) -> None:
-        """Take in the environments, by task, and start an episode in the first of them."""
-        self._task = next(iter(environments))
-        self.max_steps = self.config.max_steps or episode_limit(environments[self._task])
-        self.environments = {task: unlimited(env) for task, env in environments.items()}
+    def __init__(self, environments: dict[str, Any], fps: int) -> None:
+        """Take in the environments, by task, and start an episode in the first of them to see its sizes."""
+        self.environments = environments
         self._info_keys: set[str] = set()  # seen so far: some environments have a key only when it is true
+        self._task = next(iter(environments))
         self._begin(0, self._task)
-        self.spec = self._look(self._observe())
-        close_at_exit(self)
-
-    @abstractmethod
-    def _look(self, observation: Observation) -> EnvironmentSpec:
-        """Learn sizes and features from a first observation."""
-
-    def _spec(self, observation: Observation, fps: int, instructions: list[str]) -> EnvironmentSpec:
-        """The spec of an environment with such observations."""
-        space = self.environments[self._task].action_space
+        observation = self._observe()
         images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
-        return EnvironmentSpec(
+        texts = [self._instruction(task) for task in environments]
+        first = environments[self._task]
+        limit = self.config.max_steps
+        if not limit and first.has_wrapper_attr(LIMIT):
+            limit = first.get_wrapper_attr(LIMIT)
+        self.spec = EnvironmentSpec(
             images=images,
             state_dim=len(observation[_STATE]),
-            action_dim=space.shape[0],
-            action_low=np.asarray(space.low, np.float32),
-            action_high=np.asarray(space.high, np.float32),
+            environment_state_dim=len(observation.get(ENVIRONMENT_STATE, ())),
+            action_dim=first.action_space.shape[0],
+            action_low=np.asarray(first.action_space.low, np.float32),
+            action_high=np.asarray(first.action_space.high, np.float32),
             fps=fps,
-            max_steps=self.max_steps,
-            tasks=tuple(self.environments),
-            instructions=tuple(text for text in instructions if text),
+            max_steps=limit or MAX_STEPS,
+            tasks=tuple(environments),
+            instructions=tuple(text for text in texts if text),
         )
+        close_at_exit(self)
 
     def _processed(self, action: np.ndarray) -> np.ndarray:
         """The action as the environment takes it."""
         return action
+
+    def _instruction(self, task: str) -> str:
+        """The text of a task; empty: it has none."""
+        return self.config.task
 
     def _begin(self, seed: int, task: str) -> None:
         self._raw, _ = self._returned("reset", self.environments[task].reset(seed=seed))
@@ -140,11 +143,11 @@ class GymnasiumEnvironment(EpisodeEnvironment):
     def render(self, height: int, width: int) -> np.ndarray:
         env = self.environments[self._task]
         if env.render_mode == "rgb_array":
-            return resized(env.render(), height, width)
-        images = [value for key, value in self._observe().items() if key.startswith(_IMAGE)]
-        if not images:
-            return np.zeros((height, width, 3), np.uint8)
-        return resized(np.asarray(images[0]), height, width)  # a film shows the images of the policy
+            frame = env.render()
+        else:  # a film shows the images of the policy
+            shown = self._observe()
+            frame = next((shown[key] for key in self.spec.images), np.zeros((1, 1, 3), np.uint8))
+        return resized(np.asarray(frame), height, width)
 
     def close(self) -> None:
         for env in self.environments.values():
@@ -177,9 +180,7 @@ class GymConfig(GymnasiumConfig):
     """Keys whose numbers are, in turn, ``observation.state``; empty: the observation, if it is one vector."""
     environment_state: tuple[str, ...] = ()
     """Keys whose numbers, and the share of `max_steps` gone, are ``observation.environment_state``, for
-    ``algorithm.type=chunk_critic``. ``state``: the same as `state`."""
-    task: str = ""
-    """Instruction text."""
+    ``algorithm.type=chunk_critic``. ``state``: all of `state`, if the observation has no such key."""
     fps: Annotated[int, Range("[1, 1000]")] | None = None
     """Control rate in Hz, for datasets and videos. None: the environment's ``render_fps``, or 20."""
 
@@ -188,14 +189,6 @@ class GymConfig(GymnasiumConfig):
         if not self.id or ":" in self.id:
             hint = "use a name of Gymnasium's registry, and env.discover_packages_path for its package"
             raise InputError("env.id", self.id, hint)
-
-    @functools.cached_property
-    def state_size(self) -> int:
-        """See the base class; only the environment knows, so it is made to ask."""
-        if not self.environment_state:
-            return 0
-        with contextlib.closing(GymEnvironment(self)) as environment:
-            return len(environment.reset(0, self.id)[ENVIRONMENT_STATE])
 
 
 class GymEnvironment(GymnasiumEnvironment):
@@ -210,6 +203,8 @@ class GymEnvironment(GymnasiumEnvironment):
         self.config = config
         # Without its checker, which judges what is never read.
         options: dict[str, Any] = {"disable_env_checker": True}
+        if config.max_steps:
+            options["max_episode_steps"] = config.max_steps
         if RENDER in config.images.values():
             options["render_mode"] = "rgb_array"
         try:
@@ -220,24 +215,18 @@ class GymEnvironment(GymnasiumEnvironment):
         space = env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
             raise InputError("env.id", config.id, f"actions must be a bounded vector, they are {space}")
-        super().__init__({config.id: env})
-
-    def _look(self, observation: Observation) -> EnvironmentSpec:
-        config = self.config
-        metadata = self.environments[config.id].metadata
-        fps = config.fps or int(metadata.get("render_fps") or FPS)
-        return self._spec(observation, fps, [config.task])
+        fps = config.fps or int(env.metadata.get("render_fps") or FPS)
+        super().__init__({config.id: env}, fps)
 
     def _observe(self) -> Observation:
         raw = dict(leaves(self._raw))
         config = self.config
         state = self._vector("state", raw, config.state or ("",))
         observation: Observation = {TASK: config.task, _STATE: state}
+        if RENDER in config.images.values():
+            raw[RENDER] = self.environments[config.id].render()
         for camera, key in config.images.items():
-            if key == RENDER:
-                picture = np.array(self.environments[config.id].render())
-            else:
-                picture = np.array(_part(raw, key, "images"))
+            picture = np.array(_part(raw, key, "images"))
             if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
                 hint = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
                 raise InputError("env.images", config.images, hint)
@@ -247,9 +236,7 @@ class GymEnvironment(GymnasiumEnvironment):
             observation[f"{_IMAGE}s.{camera}"] = picture
         keys = config.environment_state
         if keys:
-            numbers = state
-            if keys != ("state",):
-                numbers = self._vector("environment_state", raw, keys)
+            numbers = self._vector("environment_state", {"state": state, **raw}, keys)
             observation[ENVIRONMENT_STATE] = np.append(numbers, np.float32(self.late))
         return observation
 
@@ -278,8 +265,6 @@ class LeRobotEnvConfig(GymnasiumConfig):
     trust_remote_code: bool = False
     """True if an environment on the Hub is run with your rights. It needs ``hub_path`` in `kwargs`, with the
     commit whose code you have read: ``owner/name@COMMIT`` or ``owner/name@COMMIT:file.py``."""
-    task: str = ""
-    """Instruction text, for environments that have none of their own."""
     camera: str = "image"
     """Name of a lone camera: ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``,
     which policies trained on LeRobot's PushT dataset expect."""
@@ -322,47 +307,15 @@ class LeRobotEnvironment(GymnasiumEnvironment):
         self._before, self._after = self._settings.get_env_processors()
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
             trust = config.trust_remote_code
-            self._vectors = make_env(self._settings, n_envs=1, trust_remote_code=trust)
-        super().__init__(_single_envs(self._vectors))
+            self._vectors = _by_task(make_env(self._settings, n_envs=1, trust_remote_code=trust))
+        environments = {task: vector.envs[0] for task, vector in self._vectors.items()}
+        super().__init__(environments, int(self._settings.fps))
 
     def _processed(self, action: np.ndarray) -> np.ndarray:
         import torch
 
         processed = self._after({"action": torch.from_numpy(action[None])})
         return np.asarray(processed["action"][0])
-
-    def close(self) -> None:
-        for suite in self._vectors.values():
-            for vector in suite.values():
-                vector.close()
-        self._vectors = {}
-        self.environments = {}
-        self._done = True
-
-    def _look(self, observation: Observation) -> EnvironmentSpec:
-        if _STATE not in observation or not any(key.startswith(_IMAGE) for key in observation):
-            hint = f"a policy needs images and a state, {self.config.name} shows {', '.join(observation)}"
-            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; use obs_type=pixels_agent_pos")
-        instructions = [self._instruction(task) for task in self.environments]
-        return self._spec(observation, int(self._settings.fps), instructions)
-
-    def _observe(self) -> Observation:
-        from lerobot.envs.utils import preprocess_observation
-
-        text = self._instruction(self._task)
-        batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
-        observation: Observation = {TASK: text}
-        for key, value in batch.items():
-            if key == _STATE:
-                observation[key] = value[0].numpy().astype(np.float32)
-            elif key.startswith(_IMAGE):
-                name = key
-                if key == _IMAGE and self.config.camera:
-                    name = f"{_IMAGE}s.{self.config.camera}"
-                # LeRobot has divided by 255; rounding brings every one of the 256 values back.
-                image = (value[0].permute(1, 2, 0) * 255).round().byte()
-                observation[name] = image.numpy().copy()
-        return observation
 
     def _instruction(self, task: str) -> str:
         env = self.environments[task].unwrapped
@@ -371,6 +324,32 @@ class LeRobotEnvironment(GymnasiumEnvironment):
             if text and isinstance(text, str):
                 return text
         return self.config.task
+
+    def close(self) -> None:
+        for vector in self._vectors.values():
+            vector.close()
+        self._vectors = {}
+        self.environments = {}
+        super().close()
+
+    def _observe(self) -> Observation:
+        from lerobot.envs.utils import preprocess_observation
+
+        text = self._instruction(self._task)
+        batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
+        images = [key for key in batch if key.startswith(_IMAGE)]
+        if _STATE not in batch or not images:
+            hint = f"a policy needs images and a state, {self.config.name} shows {', '.join(batch)}"
+            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; use obs_type=pixels_agent_pos")
+        observation: Observation = {TASK: text, _STATE: batch[_STATE][0].numpy().astype(np.float32)}
+        for key in images:
+            name = key
+            if key == _IMAGE and self.config.camera:
+                name = f"{_IMAGE}s.{self.config.camera}"
+            # LeRobot has divided by 255; rounding brings every one of the 256 values back.
+            image = (batch[key][0].permute(1, 2, 0) * 255).round().byte()
+            observation[name] = image.numpy().copy()
+        return observation
 
 
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
@@ -386,14 +365,14 @@ def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
         raise InputError("env.kwargs.hub_path", hub_path, f"{hint}: branches can be moved to other code")
 
 
-def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
-    """Name each single environment ``suite/number``, or a lone one ``suite``."""
+def _by_task(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
+    """Name each vector environment ``suite/number``, or a lone one ``suite``."""
     found = {}
     for suite, tasks in vectors.items():
         for number, vector in tasks.items():
-            alone = len(vectors) == len(tasks) == 1
-            name = suite if alone else f"{suite}/{number}"
-            found[name] = vector.envs[0]
+            found[f"{suite}/{number}"] = vector
+    if len(found) == 1:
+        return dict(zip(vectors, found.values(), strict=True))
     return found
 
 
@@ -405,26 +384,6 @@ def _batched(raw: Any) -> Any:
     if array.dtype.kind not in "fiub":
         return (raw,)
     return array[None]
-
-
-def episode_limit(env: Any) -> int:
-    """The limit that an environment or a wrapper of it has, in env steps; it is where LeRobot reads it."""
-    try:
-        limit = env.get_wrapper_attr("_max_episode_steps")
-    except AttributeError:
-        limit = None
-    return int(limit or MAX_STEPS)
-
-
-def unlimited(env: Any) -> Any:
-    """An environment with its wrappers, but without Gymnasium's time limit: ours counts, and it truncates."""
-    import gymnasium
-
-    if isinstance(env, gymnasium.wrappers.TimeLimit):
-        return unlimited(env.env)
-    if isinstance(env, gymnasium.Wrapper):
-        env.env = unlimited(env.env)
-    return env
 
 
 def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:

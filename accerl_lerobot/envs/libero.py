@@ -13,8 +13,10 @@ import functools
 import io
 import logging
 import pickletools
+import re
 import zipfile
 from dataclasses import dataclass
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,25 +35,22 @@ LEROBOT_NAMES = {"agentview": "image", "robot0_eye_in_hand": "image2"}
 """LeRobot's names of the two cameras that policies see."""
 LIMITS = {"libero_spatial": 280, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
 """Suites → LeRobot's episode limits in env steps."""
-MAX_OBJECTS = 4  # most objects that a task names as the objects of interest
-STATE_NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and vectors between them
 
 
 def package() -> Path:
     """Folder of the installed ``libero.libero``, found without importing it: that would ask the terminal."""
-    spec = find_spec("libero")
-    if spec is None or not spec.submodule_search_locations:
+    if find_spec("libero") is None:
         hint = "the package libero is not installed; pip install 'accerl-lerobot[libero]'"
         raise InputError("env.type", "libero", hint)
-    return Path(spec.submodule_search_locations[0]) / "libero"
+    return Path(str(files("libero"))) / "libero"
 
 
 @functools.cache
 def _names() -> dict[str, list[str]]:
     """Names of each suite's tasks: LIBERO's own table, read without importing LIBERO and torch with it."""
     text = (package() / "benchmark" / "libero_suite_task_map.py").read_text()
-    value = next(node.value for node in ast.parse(text).body if isinstance(node, ast.Assign))
-    return ast.literal_eval(value)
+    _, _, table = text.partition("=")
+    return ast.literal_eval(table.strip())
 
 
 @functools.cache
@@ -77,10 +76,7 @@ def bddl_file(task: str) -> Path:
 
 def instruction(task: str) -> str:
     """Text of a task, as LeRobot's environment and datasets have it."""
-    name = bddl_file(task).stem
-    _, scene, rest = name.partition("SCENE")
-    if scene:  # it has a number
-        _, _, name = rest.partition("_")
+    name = re.sub(r".*SCENE\d+_", "", bddl_file(task).stem)
     return name.replace("_", " ")
 
 
@@ -145,7 +141,6 @@ class LiberoConfig(SuiteConfig):
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
     environment = "accerl_lerobot.envs.libero_simulator:LiberoEnvironment"
     groups = staticmethod(suites)
-    STATE_NUMBERS = STATE_NUMBERS
     CAMERAS = (*LEROBOT_NAMES, "frontview", "birdview", "sideview", "galleryview", "robot0_robotview")
 
     task: str = "libero_object"

@@ -24,7 +24,6 @@ from accerl_lerobot.envs.graphics import Renderers, diverged, draw_fast, import_
 from accerl_lerobot.envs.libero import (
     FETCH,
     LEROBOT_NAMES,
-    MAX_OBJECTS,
     LiberoConfig,
     bddl_file,
     instruction,
@@ -35,10 +34,13 @@ from accerl_lerobot.errors import InputError, in_one_line
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
+MAX_OBJECTS = 4  # most objects that a task names as the objects of interest
+STATE_NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and vectors between them
 SETTLING = 10  # env steps without motion before the first observation, as in LeRobot's own environment
 MAX_FACES = 2000
 ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
-TIMESTEP = 0.002
+SUBSTEPS = 25  # simulation steps of 2 ms in an env step
+SENSOR_STEP = 23  # the simulation step in which robosuite's sensors read, once in each env step
 NEAR = 0.03  # scale in m of the squashed vectors that a critic sees
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 _alone = threading.RLock()
@@ -56,7 +58,9 @@ class LiberoEnvironment(SuiteEnvironment):
 
     def __init__(self, config: LiberoConfig) -> None:
         images = [f"observation.images.{LEROBOT_NAMES.get(camera, camera)}" for camera in config.cameras]
-        spec = unit_spec(config, images, instruction, state=8, action=7, fps=FPS)
+        spec = unit_spec(
+            config, images, instruction, state=8, environment_state=STATE_NUMBERS, action=7, fps=FPS
+        )
         # Datasets of LIBERO's demonstrations on the Hub say 10 Hz, whose actions were executed at 20 Hz.
         super().__init__(config, replace(spec, labelled_fps=(10,)))
 
@@ -102,10 +106,8 @@ class Simulator:
         if rendering == "fast":
             _make_cheap(model)
         robot = self.env.robots[0]
-        self._dofs = np.array(robot._ref_joint_vel_indexes)
-        self._joints = np.array(robot._ref_joint_pos_indexes)
-        self._fingers = np.array(robot._ref_gripper_joint_pos_indexes)
-        self._finger_dofs = np.array(robot._ref_gripper_joint_vel_indexes)
+        self._robot = robot
+        self._fingers = robot._ref_gripper_joint_pos_indexes
         self._motors = np.array(robot._ref_joint_actuator_indexes)
         self._grip_motors = np.array(robot._ref_joint_gripper_actuator_indexes)
         low, high = model.actuator_ctrlrange[self._grip_motors].T
@@ -125,7 +127,6 @@ class Simulator:
         )  # fmt: skip
         # What is looked at: the data of the last reading of the sensors, without its velocities.
         self._seen = self._mujoco.MjData(model)
-        self._fingers_seen = np.zeros(len(self._fingers))
 
     def reset(self, seed: int) -> None:
         """To the start that `seed` stands for, at rest."""
@@ -139,9 +140,8 @@ class Simulator:
             env.sim.forward()
         env._check_success()
         env._post_process()
-        env.robots[0].gripper.current_action = np.zeros(1)
+        self._robot.gripper.current_action = np.zeros(1)
         self._fresh = True
-        self._clock = SensorClock(readings=2)
         for _ in range(SETTLING):
             self.step(STILL)
 
@@ -152,7 +152,7 @@ class Simulator:
         data = self.data
         mujoco = self._mujoco
         self._closing = np.array([-0.01, 0.01]) * np.sign(action[6])
-        for i in range(round(1 / FPS / TIMESTEP)):
+        for i in range(SUBSTEPS):
             mujoco.mj_step1(model, data)
             # robosuite solves twice for the former torques before it has new ones; the solver starts there.
             mujoco.mj_fwdActuation(model, data)
@@ -163,35 +163,36 @@ class Simulator:
                 self._begin(action)
             else:
                 self._control(action, i == 0)
-            reading = self._clock.tick()
-            if reading:
+            if i == SENSOR_STEP:
                 self._seen.qpos[:] = data.qpos
             mujoco.mj_step2(model, data)
-            if reading:
-                self._fingers_seen[:] = data.qpos[self._fingers]
+            if i == SENSOR_STEP:
+                self._fingers_seen = data.qpos[self._fingers]
         success = bool(self.env._check_success())
         self.env._post_process()
         return success, not diverged(data)
 
     def _begin(self, action: np.ndarray) -> None:
         """The first simulation step is robosuite's own: its controller has the pose before the start."""
-        robot = self.env.robots[0]
+        robot = self._robot
         robot.control(action, policy_step=True)
         controller = robot.controller
-        self._rest = controller.initial_joint
-        self._gains = np.stack([controller.kp, controller.kd])
         self._limits = controller.actuator_min, controller.actuator_max
-        self._goal = np.array(controller.goal_pos), np.array(controller.goal_ori)
+        self._aim = Aim(
+            position=np.array(controller.goal_pos),
+            rotation=np.array(controller.goal_ori),
+            rest=controller.initial_joint,
+            gains=np.stack([controller.kp, controller.kd]),
+        )
         self._grip = robot.gripper.current_action
         self._fresh = False
 
     def _control(self, action: np.ndarray, decided: bool) -> None:
         if decided:
-            self._goal = self._new_goal(action)
+            self._aim = self._new_aim(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
         self._mujoco.mj_fullM(self.model, self._mass, self.data.qM)
-        aim = Aim(*self._goal, self._rest, self._gains)
-        torques = _compiled_torques()(self._arm, aim)
+        torques = _compiled_torques()(self._arm, self._aim)
         self.data.ctrl[self._motors] = np.clip(torques, *self._limits)
         self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
         self.data.ctrl[self._grip_motors] = self._grip_centre + self._grip_half * self._grip
@@ -216,10 +217,12 @@ class Simulator:
         between all these, and again squashed. No turns: a bowl looks the same from all sides.
         """
         data = self.data
-        joints = self._joints
-        dofs = self._dofs
-        arm = (data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand])
-        fingers = (data.qpos[self._fingers], data.qvel[self._finger_dofs])
+        robot = self._robot
+        joints = data.qpos[robot._ref_joint_pos_indexes]
+        speeds = data.qvel[robot._ref_joint_vel_indexes]
+        finger_speeds = data.qvel[robot._ref_gripper_joint_vel_indexes]
+        arm = (joints, speeds, self._position, data.xquat[self._hand])
+        fingers = (data.qpos[self._fingers], finger_speeds)
         points = np.tile(self._position, (1 + MAX_OBJECTS, 1))
         openings = np.zeros(MAX_OBJECTS)
         for i, name in enumerate(self.env.obj_of_interest):
@@ -274,16 +277,16 @@ class Simulator:
         mujoco.mj_comPos(self.model, self._seen)
         mujoco.mj_camlight(self.model, self._seen)
 
-    def _new_goal(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pose to go to: what the action adds to the hand's own; without a turn, the former rotation."""
+    def _new_aim(self, action: np.ndarray) -> Aim:
+        """What the action adds to the hand's own pose; without a turn, the former rotation."""
         from robosuite.utils.control_utils import set_goal_orientation
 
-        delta = self.env.robots[0].controller.scale_action(action[:6])
+        delta = self._robot.controller.scale_action(action[:6])
         turn = delta[3:]
-        _, rotation = self._goal
+        rotation = self._aim.rotation
         if turn.any():
             rotation = set_goal_orientation(turn, self._rotation)
-        return self._position + delta[:3], rotation
+        return self._aim._replace(position=self._position + delta[:3], rotation=rotation)
 
 
 @functools.cache
@@ -320,30 +323,6 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     wrench[:3] += np.linalg.solve(np.ascontiguousarray(inertia[:3, :3]), wanted[:3])
     wrench[3:] += np.linalg.solve(np.ascontiguousarray(inertia[3:, 3:]), wanted[3:])
     return np.dot(joined.T, wrench) + np.dot(mass, free) + arm.bias[:n]
-
-
-class SensorClock:
-    """When robosuite's sensors read: once in each 50 ms, with its own sums of 2 ms.
-
-    So many `readings` were forced since the reset.
-    """
-
-    def __init__(self, readings: int) -> None:
-        self._since = 0.0
-        for _ in range(readings):
-            self._since += TIMESTEP
-        self._read = True
-
-    def tick(self) -> bool:
-        """True if they read in this simulation step."""
-        self._since += TIMESTEP
-        reading = not self._read and self._since <= 1 / FPS
-        self._read |= reading
-        if self._since >= 1 / FPS:
-            reading |= not self._read
-            self._since %= 1 / FPS
-            self._read = False
-        return reading
 
 
 def _placed[Result](make: Callable[[], Result], seed: int) -> Result:
@@ -402,14 +381,14 @@ def _make_cheap(model: Any) -> None:
     """
     draw_fast(model)
     for mesh in range(model.nmesh):
-        at = int(model.mesh_faceadr[mesh])
-        count = int(model.mesh_facenum[mesh])
+        at = model.mesh_faceadr[mesh]
+        count = model.mesh_facenum[mesh]
         if count <= MAX_FACES:
             continue
         rows = slice(at, at + count)
         faces = model.mesh_face[rows]
-        first = int(model.mesh_vertadr[mesh])
-        vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+        first = model.mesh_vertadr[mesh]
+        vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
         kept, merged = _coarser_once(vertices.tobytes(), faces.tobytes())
         corners = model.mesh_facetexcoord[rows][kept] + model.mesh_texcoordadr[mesh]
         if model.mesh_texcoordnum[mesh] == 3 * count:  # each corner has its own place in the texture
@@ -427,15 +406,15 @@ def _coarser_once(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray
     """`coarser` of a mesh, computed once in a process: the robot and most objects are in many scenes."""
     points = np.frombuffer(vertices, np.float32).reshape(-1, 3)
     corners = np.frombuffer(faces, np.int32).reshape(-1, 3)
-    return coarser(points, corners, MAX_FACES)
+    return coarser(points, corners)
 
 
-def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+def coarser(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fewer faces for a mesh, between vertices that it has (vertex clustering, Rossignac and Borrel, 1993).
 
     Vertices (V, 3) in the same cell of a grid become the one that is nearest to their mean; faces, int (F,
-    3), that this leaves without an area go. The grid is the finest of some that leaves at most so many
-    faces. Gives which faces stay, int (f,), and their vertices now, int (f, 3).
+    3), that this leaves without an area go. The grid is the finest of some that leaves at most
+    `MAX_FACES`. Gives which faces stay, int (f,), and their vertices now, int (f, 3).
     """
     extent = float(np.ptp(vertices, axis=0).max())
     for cells in (96, 64, 48, 36, 27, 20, 15, 11, 8, 6):
@@ -451,7 +430,7 @@ def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndar
         merged = middle[cell[faces]]
         a, b, c = merged.T
         kept = np.flatnonzero((a != b) & (b != c) & (c != a))
-        if len(kept) <= most:
+        if len(kept) <= MAX_FACES:
             break
     return kept, merged[kept]
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import functools
 import json
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from importlib.util import find_spec
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -21,18 +21,12 @@ from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import Renderers, diverged, draw_fast, import_mujoco
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 @functools.cache
 def _tables() -> dict[str, Any]:
-    """LeRobot's MetaWorld tables: a JSON file in its package, as importing it costs seconds and memory."""
-    spec = find_spec("lerobot")
-    if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
-    path = Path(spec.submodule_search_locations[0]) / "envs" / "metaworld_config.json"
-    return json.loads(path.read_text())
+    """LeRobot's MetaWorld tables: a JSON file, as importing the module that reads it costs seconds."""
+    file = files("lerobot") / "envs" / "metaworld_config.json"
+    return json.loads(file.read_text())
 
 
 @functools.cache
@@ -62,15 +56,8 @@ class ShiftConfig(Section, section="env.shift"):
     camera: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """Metres added to the position of every camera, along its body's x, y and z."""
 
-    def apply(self, simulator: Any, cameras: Sequence[str]) -> None:
-        """Changes a MetaWorld simulator that has just been built, and moves these cameras of it."""
-        for name in cameras:
-            simulator.model.cam(name).pos[:] += self.camera
-
 
 STATE_DIM = 4
-ACTION_DIM = 4
-FPS = 80
 
 
 @EnvConfig.register_subclass("metaworld")
@@ -81,7 +68,6 @@ class MetaWorldConfig(SuiteConfig):
     expert = "accerl_lerobot.demos.record:metaworld_expert"
     environment = "accerl_lerobot.envs.metaworld:MetaWorld"
     groups = staticmethod(groups)
-    STATE_NUMBERS = 39
     CAMERAS = ("topview", "corner", "corner2", "corner3", "behindGripper", "gripperPOV")
 
     task: str = "drawer-open-v3"
@@ -107,8 +93,7 @@ class MetaWorldConfig(SuiteConfig):
 class MetaWorld(SuiteEnvironment):
     """One MetaWorld instance.
 
-    A simulator that diverges, so that MuJoCo had to reset it, ends the episode as truncated, with
-    ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
+    An episode in which the simulator diverges, so that MuJoCo had to reset it, ends as truncated.
     """
 
     config: MetaWorldConfig
@@ -117,7 +102,8 @@ class MetaWorld(SuiteEnvironment):
         if find_spec("metaworld") is None:
             raise ModuleNotFoundError("No module named 'metaworld'", name="metaworld")
         images = [f"observation.images.{camera}" for camera in config.cameras]
-        super().__init__(config, unit_spec(config, images, description, STATE_DIM, ACTION_DIM, FPS))
+        spec = unit_spec(config, images, description, state=STATE_DIM, environment_state=39, action=4, fps=80)
+        super().__init__(config, spec)
 
     def _build(self, task: str) -> Simulator:
         return Simulator(task, self.config)
@@ -142,7 +128,8 @@ class Simulator:
         env.model.cam("corner2").pos[:] = (0.75, 0.075, 0.7)  # as LeRobot's wrapper does
         if config.rendering == "fast":
             draw_fast(env.model)
-        config.shift.apply(env, config.cameras)
+        for camera in config.cameras:
+            env.model.cam(camera).pos[:] += config.shift.camera
         env.touching_object = functools.partial(touching_object, env)
         self._renderers = Renderers(env.model)
 

@@ -10,14 +10,14 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range
-from accerl_lerobot.envs.base import EnvConfig, EpisodeEnvironment, Step, names, unit_spec
+from accerl_lerobot.envs.base import EnvConfig, EpisodeEnvironment, Step, expand_tasks, unit_spec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 CAMERA = "front"
 ACTION_DIM = 2
-STATE_DIM = 4
 INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
+GROUPS = {"all": tuple(INSTRUCTIONS)}
 _SIGN = {"match": 1.0, "mirror": -1.0}
 _REACH = 0.8
 
@@ -50,23 +50,16 @@ class SimulatedConfig(EnvConfig):
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: the state, and the share of time gone."""
 
-    @property
-    def state_size(self) -> int:
-        if not self.environment_state:
-            return 0
-        return STATE_DIM + 1
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.tasks or not INSTRUCTIONS.keys() >= set(self.tasks):
-            raise InputError("env.task", self.task, f"use names from: {', '.join(INSTRUCTIONS)}")
+        expand_tasks(self.task, GROUPS)
         if self.hold > self.max_steps:  # or nothing would ever succeed
             raise InputError("env.hold", self.hold, f"use 1 to env.max_steps ({self.max_steps})")
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """The task names `task` stands for."""
-        return tuple(dict.fromkeys(names(self.task)))
+        return expand_tasks(self.task, GROUPS)
 
 
 class SimulatedEnvironment(EpisodeEnvironment):
@@ -75,7 +68,9 @@ class SimulatedEnvironment(EpisodeEnvironment):
     def __init__(self, config: SimulatedConfig) -> None:
         self.config = config
         image = f"observation.images.{CAMERA}"
-        self.spec = unit_spec(config, [image], INSTRUCTIONS.__getitem__, STATE_DIM, ACTION_DIM, fps=80)
+        self.spec = unit_spec(
+            config, [image], INSTRUCTIONS.__getitem__, state=4, environment_state=4, action=ACTION_DIM, fps=80
+        )
         self._target: np.ndarray = np.zeros(ACTION_DIM, np.float32)
         self._recent: deque[np.ndarray] = deque(maxlen=config.hold)
 

@@ -355,7 +355,7 @@ class RolloutRunner:
         else:
             self.counters.imagined_decisions += 1
         bad = nonfinite({"the reward": result.rewards, **result.observation})
-        if bad or result.info.get("nonfinite"):
+        if bad or not result.finite:
             self.counters.dropped_nonfinite += len(episode.taken) + 1
             return self._drop(slot, episode, bad or "the state of the simulator")
         reward = float(result.rewards.sum())

@@ -185,10 +185,10 @@ def check_off_policy(config: RunConfig, policy: Any, spec: EnvironmentSpec) -> N
         why = f"algorithm.type={algorithm.type} looks at whole episodes; use at least {decisions}"
         raise InputError("rollout.segment_length", config.rollout.segment_length, why)
     if isinstance(algorithm, ChunkCriticConfig):
-        check_state_model(config, policy, decisions)
+        check_state_model(config, policy, spec, decisions)
 
 
-def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
+def check_state_model(config: RunConfig, policy: Any, spec: EnvironmentSpec, decisions: int) -> None:
     """Refuse a world model that no policy of this kind has, or that such short episodes do not teach."""
     from accerl_lerobot.policies.teacher import state_spec
     from accerl_lerobot.world_model.states import new_state_model
@@ -196,8 +196,8 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
     model = config.state_model
     learns = not isinstance(model, SimulatorStateConfig)
     if policy.input_features and policy.output_features:  # a new policy reads the features that are offered
-        spec = state_spec(policy, config.policy.rename_map, config.env.state_size * policy.n_obs_steps)
-        learns = new_state_model(spec, model).learns
+        numbers = spec.environment_state_dim * policy.n_obs_steps
+        learns = new_state_model(state_spec(policy, config.policy.rename_map, numbers), model).learns
     if learns and decisions < 2:
         hint = "an episode is one decision, after which nothing follows; lower policy.n_action_steps"
         raise InputError("world_model.type", model.type, hint)
@@ -212,8 +212,8 @@ def _check_remembered(config: RunConfig, spec: EnvironmentSpec, history: int) ->
     meta = open_metadata(dataset)
     about = ("dataset.repo_id", dataset.repo_id)
     shapes: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
-    if config.env.state_size:
-        shapes[ENV_STATE] = (config.env.state_size,)
+    if spec.environment_state_dim:
+        shapes[ENV_STATE] = (spec.environment_state_dim,)
     if history > 1:
         shapes = {name: (history, *shape) for name, shape in shapes.items()}
     why = unlike(meta, shapes | {ACTION: (spec.action_dim,)})

@@ -39,6 +39,7 @@ from accerl_lerobot.engines import Engine, ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
+from accerl_lerobot.envs import EnvironmentSpec
 from accerl_lerobot.errors import InputError, check_absent, expanded, kept_traceback, printable
 from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
@@ -105,7 +106,7 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
         config = replace(config, algorithm=GIPOConfig(), world_model=None, imagination=ImaginationConfig())
         config = pinned(config)
         history = check_policy(config, spec)
-        engine = make_engine(config, spec.tasks, history, load=load_acting, learns=False)
+        engine = make_engine(config, spec, history, load=load_acting, learns=False)
         with closing(engine):
             count = config.evaluation.episodes
             engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
@@ -143,27 +144,27 @@ def _with_absolute_paths(config: RunConfig) -> RunConfig:
 
 def make_engine(
     config: RunConfig,
-    tasks: tuple[str, ...],
+    spec: EnvironmentSpec,
     history: int,
     state: Path | None = None,
     load: Load | None = None,
     learns: bool = True,
 ) -> Engine:
-    """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
+    """The engine that ``launch.engine`` names, for this environment; see `RayEngine` for the arguments."""
     config = _with_absolute_paths(config)
     if state is not None:
         state = state.absolute()
-    numbers = history * config.env.state_size
+    numbers = history * spec.environment_state_dim
     remembered = demonstrations_of(config)
     load = functools.partial(make_adapter, config.algorithm, config.state_model, numbers, remembered, load)
     if config.launch.engine == "local":
         from accerl_lerobot.engines.local import LocalEngine
 
-        return LocalEngine(config, tasks, history, state, load)
+        return LocalEngine(config, spec.tasks, history, state, load)
     ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engines.ray_engine import RayEngine
 
-    return RayEngine(config, tasks, history, state, load, learns)
+    return RayEngine(config, spec.tasks, history, state, load, learns)
 
 
 def fine_tune(
@@ -330,7 +331,7 @@ class Run:
         history = 1 if self.load else check_policy(self.config, self.spec, own=True)
         state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
         with self.console.stage("starting workers"), stop.at_once():
-            engine = make_engine(self.config, self.spec.tasks, history, state, self.load)
+            engine = make_engine(self.config, self.spec, history, state, self.load)
         recorder = Recorder(self.config, log, self.console, self.times)
         with closing(engine):
             loop = Loop(self.config, self.directory, engine, self.spec.tasks, recorder, stop)

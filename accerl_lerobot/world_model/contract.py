@@ -58,6 +58,7 @@ class WorldModelSpec(Section, section="spec"):
     action_dim: Size
     chunk: Size  # K
     fps: Size  # env steps per second, which a dataset must have too
+    labelled_fps: tuple[Size, ...] = ()  # see `EnvironmentSpec.labelled_fps`
     context: Size  # L
     tasks: tuple[str, ...] = ()  # instructions of the episodes it was trained on; empty: unknown
 
@@ -368,6 +369,6 @@ def _misfit(meta: Any, spec: WorldModelSpec) -> str | None:
             return f"{key} has shape {shape}, the environment's has ({size},): it is another robot's"
     if not {SUCCESS, REWARD} & shapes.keys():
         return f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
-    if meta.fps != spec.fps:
+    if meta.fps not in (spec.fps, *spec.labelled_fps):
         return f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
     return None

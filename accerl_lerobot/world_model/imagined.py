@@ -274,7 +274,7 @@ def check_imagination(config: RunConfig) -> None:
             "use success with imagination.environments: imagined episodes end with a success, and pay for it"
         )
         raise InputError("env.reward", reward, hint)
-    if config.env.state_size:
+    if config.env.tells_state:
         hint = "no policy reads it, and nothing imagined has it; leave it out, or imagination.environments"
         raise InputError("env.environment_state", getattr(config.env, "environment_state", None), hint)
     if policy.n_obs_steps > 1:

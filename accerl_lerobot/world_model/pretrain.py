@@ -92,7 +92,7 @@ def pretrain(
     spec = WorldModelSpec(
         cameras=tuple(sizes.images), image_size=(config.image_size, config.image_size),
         state_dim=sizes.state_dim, action_dim=sizes.action_dim, chunk=config.chunk,
-        context=config.model.context, fps=sizes.fps,
+        context=config.model.context, fps=sizes.fps, labelled_fps=sizes.labelled_fps,
     )  # fmt: skip
     with console.stage("episodes"):
         episodes = load_episodes(dataset, spec)

@@ -53,6 +53,7 @@ from tests.runs import off_policy_run
 
 GAMMA = 0.9
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
+STATE_SIZE = 5  # of its ``observation.environment_state``
 
 
 @pytest.fixture(autouse=True)
@@ -207,7 +208,7 @@ class TestActing:
     def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
         model = SimulatorStateConfig()
-        adapter = with_teacher(load_adapter, model, ENV.state_size, share=0.5, config=config, noise=0.0)
+        adapter = with_teacher(load_adapter, model, STATE_SIZE, share=0.5, config=config, noise=0.0)
         assert adapter.teacher is not None
         observation = make_environment(ENV).reset(0, "match")
         asked = [
@@ -225,14 +226,14 @@ class TestActing:
         np.testing.assert_array_equal(acts[:, 0, 0], acts[:, 1, 0])
         assert 70 < acts[:, 0, 0].sum() < 130
         state = state_of(adapter.teacher, observation)
-        assert state.shape == (1, ENV.state_size + TASK_BITS)
+        assert state.shape == (1, STATE_SIZE + TASK_BITS)
         wanted = adapter.processing.unnormalise(adapter.teacher(state).detach())[0].numpy()
         for i, (decision, before) in enumerate(zip(adapter.decide(asked[:8], 0), own, strict=True)):
             expected = wanted if acts.reshape(-1)[i] else before.chunk
             np.testing.assert_allclose(decision.chunk, expected, atol=1e-6)
 
     def test_its_noise_belongs_to_the_request(self):
-        teacher = Teacher(simulator(ENV.state_size), chunk=(4, 2), share=1.0, noise=0.5)
+        teacher = Teacher(simulator(STATE_SIZE), chunk=(4, 2), share=1.0, noise=0.5)
         with torch.no_grad():
             teacher.ready.fill_(1)
         observation = make_environment(ENV).reset(0, "match")

@@ -4,7 +4,6 @@
 import io
 import json
 import shutil
-import weakref
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
     EpisodeLabels,
@@ -36,8 +35,6 @@ from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels,
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"
 PNG = b"\x89PNG\r\n\x1a\n"
-IMAGE_REFUSED = "an image whose row does not hold it as PNG, JPEG or TIFF"
-ORIGIN = FileSource("dataset.root", "theirs")
 EPISODES, DATA = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
 
 
@@ -72,16 +69,8 @@ def test_datasets_that_are_not_there(tmp_path: Path):
             open_metadata(DatasetConfig(repo_id="a/b", root=str(root)))
     with pytest.raises(InputError, match="^dataset.repo_id=None: name a LeRobotDataset"):
         open_metadata(DatasetConfig())
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=r"^dataset.repo_id='nobody/nothing': LeRobot cannot read it \("):
         open_metadata(DatasetConfig(repo_id="nobody/nothing"))
-    assert str(caught.value).startswith("dataset.repo_id='nobody/nothing': LeRobot cannot read it (")
-    assert "\n" not in str(caught.value)
-
-
-def test_another_format_version(copied: Path):
-    edit(copied, codebase_version="v2.1")
-    with pytest.raises(InputError, match="^dataset.repo_id='a/b': its format is not v3.0.* convert with: "):
-        open_metadata(DatasetConfig(repo_id="a/b", root=str(copied)))
 
 
 @pytest.mark.parametrize(
@@ -94,6 +83,7 @@ def test_another_format_version(copied: Path):
         ({"chunks_size": 0}, "chunks_size must be positive"),
         ({"features": {"../../x": {"dtype": "float32", "shape": [4]}}}, "cannot be part of a path"),
         ({"total_episodes": 0, "total_tasks": 0}, "it has no episodes, or no tasks"),
+        ({"codebase_version": "v2.1"}, "its format is not v3.0.* convert with: "),
     ],
 )
 def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
@@ -118,21 +108,10 @@ def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
     refused(copied, "columns of kind Image; numbers and texts are wanted")
 
 
-def data_with(root: Path, images: list[dict[str, Any]]) -> None:
-    def change(table: pa.Table) -> pa.Table:
-        at = table.schema.get_field_index(CAMERA)
-        rows = images + table.column(CAMERA).to_pylist()[len(images) :]
-        kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-        return table.set_column(at, CAMERA, pa.array(rows, kind))
-
-    rewrite(root / DATA, change)
-
-
-def first_frame(root: Path) -> Any:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    with checked(ORIGIN, whole=True):
-        return LeRobotDataset("a/b", root=root, video_backend="pyav")[0]
+def postscript() -> bytes:
+    file = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(file, "EPS")
+    return file.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -140,37 +119,21 @@ def first_frame(root: Path) -> Any:
     [
         (None, "/etc/hostname"),
         (None, "http://127.0.0.1:9/x.png"),
-        (b"\xc5\xd0\xd3\xc6\x1e\0\0\0", None),
+        (postscript(), None),  # Pillow would have Ghostscript draw it
         (PNG, "/etc/hostname"),
     ],
 )
 def test_images_lie_in_their_rows(copied: Path, content: bytes | None, path: str | None):
-    data_with(copied, [{"bytes": content, "path": path}])
-    with pytest.raises(InputError, match=f"^dataset.root='theirs': data: {IMAGE_REFUSED}"):
-        first_frame(copied)
+    def change(table: pa.Table) -> pa.Table:
+        rows = [{"bytes": content, "path": path}, *table.column(CAMERA).to_pylist()[1:]]
+        kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        return table.set_column(table.schema.get_field_index(CAMERA), CAMERA, pa.array(rows, kind))
 
-
-def test_a_picture_does_not_start_a_program(copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Pillow has Ghostscript draw PostScript: here a program of that name that leaves a mark."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from PIL import EpsImagePlugin
-
-    mark = tmp_path / "mark"
-    (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {mark}\n")
-    (tmp_path / "gs").chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
-    eps = io.BytesIO()
-    Image.new("RGB", (64, 64)).save(eps, "EPS")
-    data_with(copied, [{"bytes": eps.getvalue(), "path": None}])
-    dataset = LeRobotDataset("a/b", root=copied, video_backend="pyav")
-    with pytest.raises(OSError):
-        dataset[0]
-    assert mark.exists(), "as LeRobot alone does"
-    mark.unlink()
-    with pytest.raises(InputError, match=IMAGE_REFUSED):
-        first_frame(copied)
-    assert not mark.exists()
+    rewrite(copied / DATA, change)
+    dataset = DatasetConfig(repo_id="a/b", root=str(copied))
+    refusal = "an image whose row does not hold it as PNG, JPEG or TIFF"
+    with pytest.raises(InputError, match=f"^dataset.root='.*': data: {refusal}"), checked(dataset):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")[0]
 
 
 @pytest.mark.parametrize("part", ["meta/info.json", "data/chunk-000", "videos"])
@@ -192,10 +155,15 @@ def test_an_error_of_lerobot_s_is_one_line(tmp_path: Path):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES])
-def test_a_local_dataset_is_not_completed_from_the_hub(copied: Path, part: str):
+@pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES, DATA])
+def test_a_local_dataset_is_not_completed_from_the_hub(copied: Path, part: str, monkeypatch: Any):
+    from lerobot.datasets import lerobot_dataset
+
+    monkeypatch.setattr(lerobot_dataset, "get_safe_version", None)  # it would ask the Hub for the label
     (copied / part).unlink()
-    refused(copied, "give the whole folder")
+    dataset = DatasetConfig(repo_id="a/b", root=str(copied))
+    with pytest.raises(InputError, match="^dataset.root='.*': .*give the whole folder"):
+        opened(dataset, open_metadata(dataset)).__enter__()
 
 
 def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -209,17 +177,6 @@ def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(dataset_metadata, "snapshot_download", lambda *_, **__: str(fetched))
     with pytest.raises(InputError, match="^dataset.repo_id='them/data': meta/info.json: data_path: "):
         open_metadata(DatasetConfig(repo_id="them/data"))
-
-
-def test_missing_data_are_not_fetched_from_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from lerobot.datasets import lerobot_dataset
-
-    monkeypatch.setattr(lerobot_dataset, "get_safe_version", None)  # it would ask the Hub for the label
-    dataset = write_dataset(tmp_path / "data")
-    meta = open_metadata(dataset)
-    (tmp_path / "data" / DATA).unlink()
-    with pytest.raises(InputError, match="data: files of some episodes are missing; give the whole folder"):
-        opened(dataset, meta).__enter__()
 
 
 def test_tasks_are_found_by_their_indices(tmp_path: Path):
@@ -327,17 +284,8 @@ def test_an_instruction_that_changes_is_refused_where_one_is_read(tmp_path: Path
 
 
 def test_frames_are_kept_as_bytes():
-    """One of LeRobot's frames, which are four times as large, is in memory at a time."""
-    alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
-
-    class Frames:
-        def __getitem__(self, row: int) -> dict[str, torch.Tensor]:
-            assert len(alive) <= 1
-            image = torch.full((3, 2, 4), row / 255)
-            alive.add(image)
-            return {CAMERA: image}
-
-    found = observations(Frames(), np.arange(5), {"action": np.arange(9)}, [CAMERA])
+    frames = [{CAMERA: torch.full((3, 2, 4), row / 255)} for row in range(5)]
+    found = observations(frames, np.arange(5), {"action": np.arange(9)}, [CAMERA])
     assert found["action"].tolist() == list(range(5))
     assert found[CAMERA].shape == (5, 2, 4, 3) and found[CAMERA].dtype == np.uint8
     assert found[CAMERA][:, 0, 0, 0].tolist() == list(range(5))

@@ -76,19 +76,17 @@ def _refusing(work: Callable[[], Any]) -> Any:
         raise InputError("sft.trust_remote_code", "", "no such commit") from error
 
 
-def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    said = json.dumps({"field": "sft.trust_remote_code", "value": "x.py", "why": "read it"})
-    program = f"print('Traceback')\nprint({ANSWER + said!r})\nraise SystemExit(1)"
-    monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
-    with pytest.raises(InputError) as caught:
-        run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)
-    assert str(caught.value) == "sft.trust_remote_code='x.py': read it"
-
-
-def test_a_failure_and_warnings_are_handed_over(tmp_path: Path, monkeypatch: Any, capsys: Any, caplog: Any):
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (KeyError("observation.state.x"), RuntimeError, "see .*sft.log: KeyError: 'observation.state.x'$"),
+        (InputError("sft.x", "x.py", "read it"), InputError, "^sft.x='x.py': read it$"),
+    ],
+)
+def test_a_failure_and_warnings_are_handed_over(error, kind, message, tmp_path, monkeypatch, capsys, caplog):
     def fails() -> None:
-        logging.getLogger("accerl_lerobot.x").warning("tasks differ")
-        raise KeyError("observation.state.joints")
+        logging.getLogger("accerl_lerobot.x").warning("before %s", kind.__name__)  # each is told once
+        raise error
 
     warn_once.cache_clear()
     with pytest.raises(SystemExit):
@@ -97,9 +95,9 @@ def test_a_failure_and_warnings_are_handed_over(tmp_path: Path, monkeypatch: Any
     caplog.clear()
     program = f"print({err + out!r})\nraise SystemExit(1)"
     monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
-    with pytest.raises(RuntimeError, match="see .*sft.log: KeyError: 'observation.state.joints'$"):
+    with pytest.raises(kind, match=message):
         run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)
-    assert [record.getMessage() for record in caplog.records] == ["tasks differ"]
+    assert [record.getMessage() for record in caplog.records] == [f"before {kind.__name__}"]
 
 
 def test_a_policy_of_images_does_not_read_the_simulators_state(tmp_path: Path, monkeypatch: Any):
@@ -122,13 +120,9 @@ def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path, monkeypat
     root = Path(shutil.copytree(ROOT, tmp_path / "data"))
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps(info | {"data_path": "{chunk_index:999999999}"}))
+    arguments = ("--dataset.repo_id=a/b", f"--dataset.root={root}")
     with pytest.raises(SystemExit):
-        run(
-            monkeypatch,
-            lambda: LeRobotDataset("a/b", root=root),
-            "--dataset.repo_id=a/b",
-            f"--dataset.root={root}",
-        )
+        run(monkeypatch, lambda: LeRobotDataset("a/b", root=root), *arguments)
     answer = json.loads(capsys.readouterr().out.rpartition(ANSWER)[2])
     assert answer["field"] == "dataset.root" and "is no template of a file" in answer["why"]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.demos.dataset_files import open_metadata
@@ -36,8 +37,6 @@ TASKS = "handle-press-v3,reach-v3"
 
 
 def rows(root: Path) -> list[dict]:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     dataset = LeRobotDataset("accerl/demos", root=root, video_backend="pyav")
     return [{key: np.asarray(value) for key, value in dataset[i].items()} for i in range(len(dataset))]
 
@@ -56,17 +55,12 @@ def test_lerobot_reads_it_and_the_expert_succeeds_at_the_last_frame_of_each_epis
     frame = data[0]
     assert frame["observation.images.corner2"].shape == (3, 64, 64)
     assert frame["observation.state"].shape == frame["action"].shape == (4,)
-    assert {row["episode_index"].item(): str(row["task"]) for row in data} == {
-        0: "Press a handle down",
-        1: "Reach a goal position",
-    }
+    texts = {row["episode_index"].item(): str(row["task"]) for row in data}
+    assert texts == {0: "Press a handle down", 1: "Reach a goal position"}
     info = json.loads((recorded / "meta" / "info.json").read_text())
-    assert info["fps"] == 80 and info["total_episodes"] == 2
-    assert info["features"]["observation.images.corner2"]["dtype"] == "image"
-    assert (info["features"]["next.success"]["dtype"], info["features"]["next.success"]["shape"]) == (
-        "bool",
-        [1],
-    )
+    features = info["features"]
+    assert info["fps"] == 80 and features["observation.images.corner2"]["dtype"] == "image"
+    assert (features["next.success"]["dtype"], features["next.success"]["shape"]) == ("bool", [1])
     last = [i for i, row in enumerate(data) if i + 1 == len(data) or data[i + 1]["frame_index"] == 0]
     assert len(last) == 2
     for name in ("next.reward", "next.done", "next.success"):
@@ -83,26 +77,18 @@ def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: 
 def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
     env = SimulatedConfig(task="match,mirror", max_steps=60, hold=25)
     record_dataset(tmp_path / "mixed", env, episodes=8, failure_share=0.5, seed=3)
-    data = rows(tmp_path / "mixed")
-    outcome: dict[str, list[bool]] = {"Match the target": [], "Mirror the target": []}
-    for row in data:
-        if row["next.done"]:
-            outcome[str(row["task"])].append(bool(row["next.success"]))
-    assert {task: sorted(wins) for task, wins in outcome.items()} == {
-        task: [False, False, True, True] for task in outcome
-    }
+    ends = [row for row in rows(tmp_path / "mixed") if row["next.done"]]
+    for task in ("Match the target", "Mirror the target"):
+        outcomes = [bool(row["next.success"]) for row in ends if str(row["task"]) == task]
+        assert sorted(outcomes) == [False, False, True, True]
 
 
 def match(seed: int = 5, noise: float = 0.0, push: float = 0.0) -> Episode:
     config = SimulatedConfig(tolerance=0.01, max_steps=20)
     environment = make_environment(config)
     expert = make_expert(config, environment, "match")
-    return played(
-        environment,
-        "match",
-        seed,
-        disturbed(expert, environment.spec, seed, noise=noise, push=push, fail=False),
-    )
+    actions = disturbed(expert, environment.spec, seed, noise=noise, push=push, fail=False)
+    return played(environment, "match", seed, actions)
 
 
 def test_noise_is_in_the_recorded_action_and_seeded():
@@ -132,8 +118,7 @@ def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: 
 
 def test_replaying_its_actions_gives_its_frames():
     pytest.importorskip("metaworld")
-    lerobot_dataset = pytest.importorskip("lerobot.datasets.lerobot_dataset")
-    dataset = lerobot_dataset.LeRobotDataset("accerl/metaworld_tiny", root=TINY, video_backend="pyav")
+    dataset = LeRobotDataset("accerl/metaworld_tiny", root=TINY, video_backend="pyav")
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (4, 365, 80)
     environment = make_environment(MetaWorldConfig(task="drawer-open-v3"))
     observation, reward = environment.reset(0, "drawer-open-v3"), 0.0
@@ -153,13 +138,9 @@ def test_replaying_its_actions_gives_its_frames():
 
 def test_an_instruction_is_asked_for_where_the_environment_has_none():
     """`export` calls it as well, before an episode is repeated."""
-    config = GymConfig(id="reach/Reach-v0")
-    spec = make_environment(SimulatedConfig()).spec
-    check_instruction(spec, config)
-    silent = replace(spec, instructions=())
+    spec = replace(make_environment(SimulatedConfig()).spec, instructions=())
     with pytest.raises(InputError, match="^env.task='': each frame of a dataset has an .*--env.task="):
-        check_instruction(silent, config)
-    check_instruction(silent, replace(config, task="Reach the goal"))
+        check_instruction(spec, GymConfig(id="reach/Reach-v0"))
 
 
 @pytest.fixture(scope="module")
@@ -182,8 +163,6 @@ def exported(run: Path, root: Path, *options: str) -> int:
 
 
 def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsys):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     capsys.readouterr()
     assert main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 0  # in processes of its own
     found = json.loads(capsys.readouterr().out)
@@ -203,9 +182,8 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsy
         assert [bool(row["next.done"]) for row in rows] == [False] * (len(rows) - 1) + [True]
         assert bool(rows[-1]["next.success"]) is parts[-1].success
     settings: RunConfig = parse(RunConfig, [f"--config_path={run / 'config.yaml'}"])
-    written = dataset_features(
-        open_metadata(DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set")))
-    )
+    exported_set = DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set"))
+    written = dataset_features(open_metadata(exported_set))
     check_features(written, env_features(make_environment(settings.env).spec), {}, "dataset.repo_id", "")
 
 

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from transformers import AutoTokenizer
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
@@ -22,6 +24,7 @@ from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.demos.sft import ANSWER, SFTConfig, picked, run_sft, sft_command
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from datasets import Image
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
 from tests.tiny_datasets import record_dataset
@@ -40,16 +43,10 @@ TINY = SFTConfig(
 )  # fmt: skip
 
 
-def stock_dataset(episodes: list[int] | None = None) -> Any:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
+def stock_dataset(episodes: list[int] | None = None) -> LeRobotDataset:
+    chunk = {"action": [i / 80 for i in range(4)]}
     return LeRobotDataset(
-        "accerl/metaworld_tiny",
-        root=ROOT,
-        episodes=episodes,
-        delta_timestamps={"action": [i / 80 for i in range(4)]},
-        video_backend="pyav",
-        return_uint8=True,
+        "a/b", ROOT, episodes, delta_timestamps=chunk, video_backend="pyav", return_uint8=True
     )
 
 
@@ -59,55 +56,34 @@ def equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
     )
 
 
-def test_cached_items_are_the_stock_ones_at_every_reading():
-    dataset = stock_dataset()
-    cached = guarded_train.CachedDataset(dataset)
-    assert len(cached) == len(dataset) == 365
-    for index in (0, 7, 88, 364):  # 364: a chunk that reaches beyond its episode
-        for _ in range(2):
-            assert equal(cached[index], dataset[index])
-    assert cached[364]["action_is_pad"].tolist() == [False, True, True, True]
-    assert cached.meta is dataset.meta and cached.num_frames == 365
-
-
 @pytest.mark.parametrize("episodes", [None, [1, 2]])
-def test_a_chunk_is_read_without_decoding_its_images(episodes: list[int] | None, monkeypatch: Any):
-    from lerobot.datasets.dataset_reader import DatasetReader
-
-    from datasets import Image
-
+def test_items_are_the_stock_ones_from_memory_and_decode_no_image_twice(episodes: Any, monkeypatch: Any):
     dataset = stock_dataset(episodes)
     indices = (0, 7, 88, len(dataset) - 1)
     stock = [dataset[index] for index in indices]
+    assert stock[-1]["action_is_pad"].tolist() == [False, True, True, True]  # reaches beyond its episode
     decode, decoded = Image.decode_example, []
     monkeypatch.setattr(Image, "decode_example", lambda *args, **kw: decoded.append(1) or decode(*args, **kw))
     monkeypatch.setattr(DatasetReader, "_query_hf_dataset", guarded_train.query_rows)
-    assert all(equal(dataset[index], item) for index, item in zip(indices, stock, strict=True))
-    assert len(decoded) == len(indices) * len(dataset.meta.camera_keys)
+    cached = guarded_train.CachedDataset(dataset)
+    assert cached.meta is dataset.meta and len(cached) == cached.num_frames == len(dataset)
+    for _ in range(2):
+        assert all(equal(cached[index], item) for index, item in zip(indices, stock, strict=True))
+    assert len(decoded) == len(indices)
 
 
-class TestPick:
-    @pytest.fixture(scope="class")
-    def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
-        """Every second episode fails."""
-        root = tmp_path_factory.mktemp("demos") / "dataset"
-        return record_dataset(root, SimulatedConfig(max_steps=16), episodes=4, failure_share=0.5)
-
-    def test_episodes_by_their_label(self, dataset: DatasetConfig, tmp_path: Path):
-        assert picked(dataset, "all") is None
-        assert picked(dataset, "successes") == [0, 2] and picked(dataset, "failures") == [1, 3]
-        command = sft_command(TINY, dataset, tmp_path, 0, "cpu", [0, 2])
-        assert "--dataset.episodes=[0, 2]" in command
-
-    def test_none_of_a_kind_or_no_labels_at_all_are_refused(self, dataset: DatasetConfig, tmp_path: Path):
-        data = LeRobotDataset("a/b", root=dataset.root)
-        delete_episodes(data, [0, 2], output_dir=tmp_path / "lost", repo_id="a/b")
-        labels = ["next.success", "next.reward"]
-        remove_feature(data, labels, output_dir=tmp_path / "bare", repo_id="a/b")
-        with pytest.raises(InputError, match=r"^sft\.pick='successes': none of .* 2 episodes; use all"):
-            picked(replace(dataset, root=str(tmp_path / "lost")), "successes")
-        with pytest.raises(InputError, match=r"^sft\.pick='failures': .*not labelled by next\.success or"):
-            picked(replace(dataset, root=str(tmp_path / "bare")), "failures")
+def test_episodes_are_picked_by_their_label(tmp_path: Path):
+    env = SimulatedConfig(max_steps=16)
+    dataset = record_dataset(tmp_path / "dataset", env, episodes=4, failure_share=0.5)
+    assert picked(dataset, "all") is None
+    assert picked(dataset, "successes") == [0, 2] and picked(dataset, "failures") == [1, 3]
+    data = LeRobotDataset("a/b", root=dataset.root)
+    delete_episodes(data, [0, 2], output_dir=tmp_path / "lost", repo_id="a/b")
+    with pytest.raises(InputError, match=r"^sft\.pick='successes': none of .* 2 episodes; use all"):
+        picked(replace(dataset, root=str(tmp_path / "lost")), "successes")
+    remove_feature(data, ["next.success", "next.reward"], output_dir=tmp_path / "bare", repo_id="a/b")
+    with pytest.raises(InputError, match=r"^sft\.pick='failures': .*not labelled by next\.success or"):
+        picked(replace(dataset, root=str(tmp_path / "bare")), "failures")
 
 
 def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
@@ -171,9 +147,8 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    command_that(
-        monkeypatch, "import os, time\nprint(f'step:{os.getpid()} loss:1', flush=True)\ntime.sleep(600)"
-    )
+    program = "import os, time\nprint(f'step:{os.getpid()} loss:1', flush=True)\ntime.sleep(600)"
+    command_that(monkeypatch, program)
     seen: list[int] = []
 
     def interrupt(step: int, loss: float) -> None:
@@ -189,24 +164,20 @@ def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypat
 
 
 def test_the_command_line(tmp_path: Path):
-    command = sft_command(
-        TINY, DatasetConfig(repo_id="a/b", root="/data", revision="v1"), tmp_path / "sft", 3, "cpu"
-    )
+    dataset = DatasetConfig(repo_id="a/b", root="/data", revision="v1")
+    command = sft_command(TINY, dataset, tmp_path / "sft", 3, "cpu", [0, 2])
     assert command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
-    wanted = {
+    assert {
         "--policy.type=smolvla", "--policy.resize_imgs_with_padding=[32, 32]", "--policy.device=cpu",
         "--policy.train_expert_only=false", f"--policy.vlm_model_name={tmp_path / 'backbone'}",
         "--policy.push_to_hub=false", "--policy.optimizer_lr=0.001", "--policy.scheduler_decay_steps=2",
-        "--dataset.repo_id=a/b", "--dataset.root=/data", "--dataset.revision=v1", "--steps=2", "--seed=3",
-    }  # fmt: skip
-    assert wanted <= set(command)
-    start = tmp_path / "start"
-    start.mkdir()
-    (start / "config.json").write_text('{"type": "smolvla"}')
-    config = SFTConfig(steps=2, init_path=str(start), extra_args=["--log_freq=1"])
+        "--dataset.repo_id=a/b", "--dataset.root=/data", "--dataset.revision=v1",
+        "--dataset.episodes=[0, 2]", "--steps=2", "--seed=3",
+    } <= set(command)  # fmt: skip
+    (tmp_path / "config.json").write_text('{"type": "smolvla"}')
+    config = SFTConfig(steps=2, init_path=str(tmp_path), extra_args=["--log_freq=1"])
     command = sft_command(config, HUB, tmp_path / "sft", 0, "cuda")
-    assert f"--policy.path={start}" in command
-    assert command[-1] == "--log_freq=1"
+    assert f"--policy.path={tmp_path}" in command and command[-1] == "--log_freq=1"
     assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
 
 
@@ -225,9 +196,7 @@ def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set
 
 
 def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, monkeypatch):
-    from accerl_lerobot.checkpoint.layout import relocate
-
-    start = tmp_path / "start"
+    start, moved = tmp_path / "start", tmp_path / "moved"
     adapter_at(tiny_checkpoint).save(start)
     seen: list[str | None] = []
 
@@ -237,30 +206,22 @@ def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, mo
 
     monkeypatch.setattr(sft, "sft_command", command)
     run_sft(SFTConfig(steps=1, init_path=str(start)), HUB, tmp_path / "one" / "sft", seed=0)
-    shutil.move(start, tmp_path / "moved")
-    before = (tmp_path / "moved" / "config.json").read_text()
-    moved = SFTConfig(steps=1, init_path=str(tmp_path / "moved"))
+    shutil.move(start, moved)
+    before = (moved / "config.json").read_text()
+    copy = tmp_path / "two" / "init"
     for _ in range(2):  # the second time after one that was stopped
-        run_sft(moved, HUB, tmp_path / "two" / "sft", seed=0)
-    assert seen == [str(start), *[str(tmp_path / "two" / "init")] * 2]
-    assert (tmp_path / "moved" / "config.json").read_text() == before
-    copied = (tmp_path / "two" / "init" / "config.json").read_text()
-    relocate(tmp_path / "two" / "init", tmp_path / "two" / "init")
-    assert (tmp_path / "two" / "init" / "config.json").read_text() == copied
+        run_sft(SFTConfig(steps=1, init_path=str(moved)), HUB, tmp_path / "two" / "sft", seed=0)
+    assert seen == [str(start), str(copy), str(copy)]
+    assert (moved / "config.json").read_text() == before
+    assert json.loads((copy / "config.json").read_text())["vlm_model_name"].startswith(str(copy))
 
 
 TEXTS = ["Open the door", "Close the drawer"]
 
 
-def tokenizer_of(directory: Path) -> Any:
-    from transformers import AutoTokenizer
-
-    return AutoTokenizer.from_pretrained(directory)
-
-
 def test_instructions_are_few_tokens_and_others_still_encode(tmp_path: Path):
-    learned = tokenizer_of(write_backbone(tmp_path / "learned", TEXTS))
-    plain = tokenizer_of(write_backbone(tmp_path / "plain"))
+    learned = AutoTokenizer.from_pretrained(write_backbone(tmp_path / "learned", TEXTS))
+    plain = AutoTokenizer.from_pretrained(write_backbone(tmp_path / "plain"))
     assert [len(plain(text).input_ids) for text in TEXTS] == [13, 16], "a byte each"
     assert all(len(learned(text).input_ids) <= 5 for text in TEXTS)
     for text in (*TEXTS, "Öffne die Tür 🚪", "pick\tup\n"):

@@ -49,7 +49,7 @@ def test_observations_are_mapped():
     assert seen["observation.images.front"].shape == (16, 16, 3) and seen["task"] == "Reach the goal"
     later = environment.step_chunk(np.zeros((4, 2), np.float32)).observation
     assert later["observation.environment_state"][-1] == 4 / 16
-    assert config("--env.environment_state=[goal]").state_size == 3 and config().state_size == 0
+    assert environment.spec.environment_state_dim == 3
 
 
 def test_a_rendered_picture_and_the_whole_observation():
@@ -72,11 +72,14 @@ class Tilted(gymnasium.Wrapper):
         return self.env.step(action / 2)
 
 
-def test_the_environment_keeps_its_wrappers_but_not_its_time_limit():
-    def tilted(**options: Any) -> gymnasium.Env:
-        return Tilted(gymnasium.make("Pendulum-v1", max_episode_steps=3, **options))
+def tilted(**options: Any) -> gymnasium.Env:
+    return Tilted(gymnasium.make("Pendulum-v1", max_episode_steps=-1, **options))
 
-    gymnasium.register("Tilted-v0", tilted, max_episode_steps=2)
+
+gymnasium.register("Tilted-v0", tilted, max_episode_steps=2)
+
+
+def test_the_environment_keeps_its_wrappers_but_not_its_time_limit():
     observed = []
     for name, torque in (("Tilted-v0", 2.0), ("Pendulum-v1", 1.0)):
         environment = make_environment(GymConfig(id=name, images={}, reward="env", max_steps=6))
@@ -88,6 +91,13 @@ def test_the_environment_keeps_its_wrappers_but_not_its_time_limit():
     assert observed[0] == observed[1]
 
 
+def test_the_environment_has_its_own_limit():
+    assert make_environment(odd()).spec.max_steps == 7
+    assert make_environment(odd(max_steps=3)).spec.max_steps == 3
+    assert make_environment(odd(kwargs={"max_episode_steps": 9})).spec.max_steps == 9
+    assert make_environment(config("--env.max_steps=0")).spec.max_steps == 500
+
+
 class Odd(gymnasium.Env):
     """A point that says more than is read of it, reward and end as arrays of one number."""
 
@@ -95,13 +105,7 @@ class Odd(gymnasium.Env):
     action_space = spaces.Box(-1, 1, (1,), np.float32)
     observation_space = spaces.Dict(agent_pos=spaces.Box(-1, 1, (2,), np.float32))
 
-    def __init__(
-        self,
-        seeds: str = "follow",
-        told: dict[str, Any] | None = None,
-        fails: Exception | None = None,
-        render_mode: str | None = None,
-    ) -> None:
+    def __init__(self, seeds="follow", told=None, fails=None, render_mode=None) -> None:
         if fails is not None:
             raise fails
         self.seeds, self.told, self.render_mode = seeds, told, render_mode
@@ -109,12 +113,9 @@ class Odd(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.steps = 0
-        number = {
-            "follow": self.np_random.uniform(),
-            "same": 0.5,
-            "ignore": np.random.default_rng().uniform(),
-        }
-        self.position = np.full(2, number[self.seeds], np.float32)
+        drawn = {"follow": self.np_random, "ignore": np.random.default_rng()}
+        number = drawn[self.seeds].uniform() if self.seeds in drawn else 0.5
+        self.position = np.full(2, number, np.float32)
         return self.seen(), {}
 
     def step(self, action: np.ndarray) -> Any:
@@ -160,30 +161,6 @@ def test_success_is_read_by_its_key_and_ends_the_episode(key: str, told: dict[st
     assert "it has no keys" in ended(odd()).note
 
 
-def test_the_environment_has_its_own_limit():
-    assert make_environment(odd()).spec.max_steps == 7
-    assert make_environment(odd(max_steps=3)).spec.max_steps == 3
-    unlimited = GymConfig(id="reach/Reach-v0", images={}, state=("agent_pos",))
-    assert "reach/Reach-v0" in gymnasium.registry or make_environment(config())
-    assert make_environment(unlimited).spec.max_steps == 500
-    assert make_environment(odd(kwargs={"max_episode_steps": 9})).spec.max_steps == 9
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"fails": ValueError("it is broken")}, r"env\.kwargs=.*Odd-v0.*\(ValueError: it is broken\)"),
-        ({"fails": RuntimeError("gladLoadGL error")}, r"MUJOCO_GL='.*': the environment cannot draw"),
-        ({"fails": ModuleNotFoundError("x", name="arms.left")}, r"env\.id=.*: the package arms is not"),
-        ({"fast": True}, r"env\.kwargs={'fast': True}: Odd-v0: the environment fails \(TypeError: .*'fast'"),
-    ],
-)
-def test_an_environment_that_fails_is_one_line_without_a_question(fields: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=message) as caught:
-        make_environment(odd(kwargs=fields))
-    assert "discover_packages_path" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("seeds", "warning"),
     [
@@ -200,15 +177,19 @@ def test_starts_that_do_not_follow_from_the_seed_are_told(
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("given", "message"),
     [
         ("--env.id=reach/Nothing-v0", r"env\.id='reach/Nothing-v0': .*env\.discover_packages_path"),
         ("--env.id=CartPole-v1", r"env\.id='CartPole-v1': actions must be a bounded vector"),
         ("--env.images={front: frames}", r"env\.images='frames': the observation has agent_pos"),
         ("--env.images={front: goal}", r"env\.images=.*uint8 \(H, W, 3\)"),
         ("--env.state=[]", r"env\.state='': the observation has agent_pos"),
+        ({"fails": ValueError("broken")}, r"env\.id='Odd-v0': the environment fails \(ValueError: broken\)"),
+        ({"fails": RuntimeError("gladLoadGL error")}, r"MUJOCO_GL='.*': the environment cannot draw"),
+        ({"fails": ModuleNotFoundError("x", name="arms.left")}, r"env\.id=.*: the package arms is not"),
+        ({"fast": True}, r"env\.id='Odd-v0': the environment fails \(TypeError: .*'fast'"),
     ],
 )
-def test_bad_values_name_field_and_remedy(changed: str, message: str):
+def test_bad_values_and_failures_are_one_line(given: Any, message: str):
     with pytest.raises(InputError, match=message):
-        make_environment(config(changed))
+        make_environment(config(given) if isinstance(given, str) else odd(kwargs=given))

@@ -45,10 +45,8 @@ def some_actions(count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_names_and_texts_are_liberos_own():
-    assert LiberoConfig(task="libero_goal/2, libero_goal").tasks == (
-        "libero_goal/2",
-        *(f"libero_goal/{i}" for i in (0, 1, *range(3, 10))),
-    )
+    numbers = [int(task[-1]) for task in LiberoConfig(task="libero_goal/2, libero_goal").tasks]
+    assert numbers == [2, 0, 1, *range(3, 10)]
     assert len(LiberoConfig(task="libero_90").tasks) == 90
     limits = {"libero_object": 280, "libero_goal/3": 300, "libero_spatial,libero_10/0": 520}
     assert {task: LiberoConfig(task=task).time_limit for task in limits} == limits
@@ -58,20 +56,6 @@ def test_names_and_texts_are_liberos_own():
     assert instruction("libero_object/3") == "pick up the bbq sauce and place it in the basket"
     assert instruction("libero_10/2") == "turn on the stove and put the moka pot on it"
     assert bddl_file("libero_90/0").is_file()
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"task": "libero_objects"}, "'libero_objects' is no task; did you mean libero_object or"),
-        ({"task": "libero_goal/10"}, "'libero_goal/10' is no task"),
-        ({"camera": "agentview,agentview"}, "name each camera once"),
-        ({"camera": "agentview_image"}, "separated by commas, of: agentview, robot0_eye_in_hand, "),
-    ],
-)
-def test_wrong_fields_are_refused(fields: dict[str, str], message: str):
-    with pytest.raises(InputError, match=message):
-        LiberoConfig(**fields)
 
 
 def test_recorded_starts_are_read_without_unpickling():
@@ -127,8 +111,8 @@ def test_a_coarser_mesh_keeps_its_shape_and_its_picture():
     corner = (np.arange(60)[:, None] * 61 + np.arange(60)).ravel()
     squares = np.stack([corner, corner + 61, corner + 62, corner + 1], 1)
     faces = np.concatenate([squares[:, [0, 1, 2]], squares[:, [0, 2, 3]]])
-    kept, merged = coarser(vertices, faces, most=1000)
-    assert 300 < len(kept) <= 1000 and len(merged) == len(kept)
+    kept, merged = coarser(vertices, faces)
+    assert 600 < len(kept) <= 2000 and len(merged) == len(kept)
 
     def area(of: np.ndarray) -> float:
         a, b, c = (vertices[of[:, k]] for k in range(3))
@@ -153,55 +137,21 @@ def environment() -> Iterator[LiberoEnvironment]:
 
 
 @needs_assets
-def test_same_seed_same_episode_whatever_went_before(environment: LiberoEnvironment):
-    seeds = eval_seed(0, 3), train_seed(0, 0, 1)
-    for seed, task in zip(seeds, environment.spec.tasks, strict=True):
-        episodes = []
-        for between in environment.spec.tasks:
-            environment.reset(train_seed(1, 0, 4), between)
-            environment.step_chunk(some_actions(7, 5))
-            first = environment.reset(seed, task)
-            last = environment.step_chunk(some_actions(12)).observation
-            episodes.append([*first.values(), *last.values()])
-        assert all(np.array_equal(a, b) for a, b in zip(*episodes, strict=True))
-
-
-@needs_assets
 def test_starts_of_evaluation_are_the_recorded_ones_and_others_are_drawn(environment: LiberoEnvironment):
     task = "libero_spatial/3"
-    environment.reset(eval_seed(2, 0), task)
-    simulator = environment.simulator
     bowl = slice(9, 11)  # x and y of the first object, behind the arm and the fingers
 
     def start(seed: int) -> np.ndarray:
         environment.reset(seed, task)
-        return simulator.data.qpos[bowl].copy()
+        return environment.simulator.data.qpos[bowl].copy()
 
-    recorded = recorded_states(task).reshape(50, -1)[:, 1 : 1 + simulator.model.nq][:, bowl]
-
-    def distances(seed: int) -> np.ndarray:
-        return np.abs(start(seed) - recorded).max(axis=1)
-
+    drawn = [start(seed) for seed in (train_seed(0, 0, 0), train_seed(0, 0, 1), demo_seed(0, 0))]
+    recorded = recorded_states(task).reshape(50, -1)[:, 1:][:, bowl]
     for index in (0, 7, 49, 50):
-        found = distances(eval_seed(2, index))
-        assert found.argmin() == index % 50 and found.min() < 1e-3, "in half a second it hardly moves"
-    drawn = [train_seed(0, 0, 0), train_seed(0, 0, 1), demo_seed(0, 0)]
-    for seed in drawn:
-        assert distances(seed).min() > 1e-5
-    assert np.abs(start(drawn[0]) - start(drawn[1])).max() > 1e-3
-
-
-@needs_assets
-def test_what_is_observed_after_a_chunk(environment: LiberoEnvironment):
-    environment.reset(5, "libero_spatial/3")
-    observation = environment.step_chunk(some_actions(10)).observation
-    assert observation["observation.state"].shape == (8,) and observation[IMAGE].shape == (64, 64, 3)
-    state = observation["observation.environment_state"]
-    assert state.shape == (environment.config.state_size,)
-    assert observation["task"].startswith("pick up the black bowl")
-    way = environment.simulator.pose("akita_black_bowl_1")[0] - environment.simulator.hand[0]
-    assert np.array([state[41:44], state[71:74]]) == pytest.approx(np.array([way, np.tanh(way / 0.03)]))
-    assert state[-1] == pytest.approx(10 / 280)
+        distances = np.abs(start(eval_seed(2, index)) - recorded).max(axis=1)
+        assert distances.argmin() == index % 50 and distances.min() < 1e-3, "it hardly moves in half a second"
+    assert all(np.abs(place - recorded).max(axis=1).min() > 1e-5 for place in drawn)
+    assert np.abs(drawn[0] - drawn[1]).max() > 1e-3
 
 
 @needs_assets
@@ -218,9 +168,14 @@ def test_state_has_all_that_a_task_is_about(task: str, opening: tuple[str, ...])
     with contextlib.closing(make_environment(config)) as environment:
         assert isinstance(environment, LiberoEnvironment)
         state = environment.reset(eval_seed(0, 0), task)["observation.environment_state"]
-        names = environment.simulator.env.obj_of_interest
-        where = np.concatenate([environment.simulator.pose(name)[0] for name in names])
-        joints = [environment.simulator.data.joint(name).qpos[0] for name in opening]
+        simulator = environment.simulator
+        where = np.concatenate([simulator.position(name) for name in simulator.env.obj_of_interest])
+        way = where[:3] - simulator.hand[0]
+        joints = [simulator.data.joint(name).qpos[0] for name in opening]
+        assert state.shape == (environment.spec.environment_state_dim,) and state[-1] == 0
+    assert np.array([state[41:44], state[71:74]]) == pytest.approx(
+        np.array([way, np.tanh(way / 0.03)]), abs=1e-6
+    )
     assert state[25 : 25 + where.size] == pytest.approx(where, abs=1e-6)  # behind the robot's numbers
     openings = state[37:41]
     assert openings.sum() == pytest.approx(sum(joints), abs=1e-6) and np.any(openings) == bool(opening)

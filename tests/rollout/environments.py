@@ -22,7 +22,7 @@ class ScriptedEnvironment(Environment):
         steps: length of an episode in env steps.
         end: ``success`` (terminates), ``failure`` (terminates) or ``limit`` (truncates).
         nan_at: step of an episode that is no number; 0 for never.
-        nan_in: what of it: its ``reward``, the ``state`` after it, or what the environment says in ``info``.
+        nan_in: what of it: its ``reward``, the ``state`` after it, or of the ``simulator``.
     """
 
     def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0, nan_in: str = "reward") -> None:
@@ -58,7 +58,7 @@ class ScriptedEnvironment(Environment):
             terminated=terminated,
             truncated=over and self.end == "limit",
             success=over and self.end == "success",
-            info={"nonfinite": 1.0} if broken and self.nan_in == "info" else {},
+            finite=not (broken and self.nan_in == "simulator"),
         )
 
     def render(self, height: int, width: int) -> np.ndarray:

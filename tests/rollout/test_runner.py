@@ -100,7 +100,7 @@ def test_a_result_has_the_totals_of_its_episode_and_the_oldest_and_newest_weight
     assert recorder.segments[0].version.tolist() == [4, 3, 5]
 
 
-@pytest.mark.parametrize("nan_in", ["reward", "state", "info"])
+@pytest.mark.parametrize("nan_in", ["reward", "state", "simulator"])
 def test_a_nan_is_counted_and_the_next_episode_goes_on(nan_in: str):
     environments = [ScriptedEnvironment(steps=20, nan_at=9, nan_in=nan_in)]
     recorder = Recorder(environments, [explore(1)], CONFIG)

@@ -166,3 +166,5 @@ def test_what_cannot_be_learned_from(changes: dict[str, Any], why: str, monkeypa
     monkeypatch.setattr(contract, "open_metadata", lambda dataset: meta)
     with pytest.raises(InputError, match=f"^other.repo_id='a/b': {why}"):
         contract.check_dataset(DatasetConfig(repo_id="a/b"), SPEC, "other")
+    if "fps" in changes:  # as datasets of LIBERO's demonstrations are labelled
+        contract.check_dataset(DatasetConfig(repo_id="a/b"), replace(SPEC, labelled_fps=(10,)), "other")

@@ -19,6 +19,7 @@ from safetensors.torch import save_file
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -72,7 +73,7 @@ def test_it_learns_in_a_run(config: RunConfig, tiny_checkpoint: Path, monkeypatc
         trainer=TrainerConfig(updates=2, batch_decisions=160, warmup_updates=0, value_warmup_updates=1),
         launch=LaunchConfig(engine="local"),
     )
-    engine: Any = make_engine(tiny, ("match",), history=1)
+    engine: Any = make_engine(tiny, make_environment(tiny.env).spec, history=1)
     engine.train()
     updates = [update for progress in drive(engine) for update in progress.updates]
     engine.close()

@@ -16,6 +16,7 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engines.stopping import WorkerError
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.worker import TrainerWorker
@@ -156,7 +157,7 @@ def test_a_run_on_a_state_that_another_process_learns(
         trainer=TrainerConfig(updates=400, batch_decisions=16, value_warmup_updates=4),
     )
     config = replace(config, replay=replace(config.replay, max_lag=200))
-    engine = make_engine(config, ("match",), history=1)
+    engine = make_engine(config, make_environment(config.env).spec, history=1)
     try:
         engine.train()
         for progress in polls(engine):  # a teacher acts once critic and teacher have learned on the state

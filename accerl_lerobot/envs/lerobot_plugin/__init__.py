@@ -24,7 +24,7 @@ from accerl_lerobot.config.parsing import DISCOVER, decode
 from accerl_lerobot.envs import EnvConfig as EnvironmentConfig
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError, warn_once
-from accerl_lerobot.experience import Observation
+from accerl_lerobot.experience import TASK, Observation
 
 VIDEO_SIZE = 256
 
@@ -34,13 +34,12 @@ class AccerlEnv(gym.Env):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
+    task_description = ""
 
     def __init__(self, config: EnvironmentConfig, task: str) -> None:
         self._environment = make_environment(config)  # its simulator is built at the first reset
         spec = self._environment.spec
         self.task = task
-        instructions = dict(zip(spec.tasks, spec.instructions, strict=False))
-        self.task_description = instructions.get(task, "")
         self.metadata = self.metadata | {"render_fps": spec.fps}
         self._max_episode_steps = spec.max_steps  # LeRobot's rollout asks for it under this name
         images = {_camera(key): Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
@@ -55,13 +54,15 @@ class AccerlEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**32))
-        return self._format(self._environment.reset(seed, self.task)), {"is_success": False}
+        observation = self._environment.reset(seed, self.task)
+        self.task_description = str(observation[TASK])
+        return self._format(observation), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         result = self._environment.step_chunk(np.asarray(action, np.float32)[None])
         if result.note:
             warn_once(result.note)
-        info = {"is_success": result.success, **result.info}
+        info = {"is_success": result.success}
         observation = self._format(result.observation)
         return observation, float(result.rewards[0]), result.terminated, result.truncated, info
 
