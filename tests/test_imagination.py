@@ -177,8 +177,8 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engines.ray_engine import RayEngine
 
-    n = 20
-    config = imagining(tiny_checkpoint, world_model, episodes=n)
+    n = 80  # so many that some are left when the process is missed, on a busy machine too
+    config = imagining(tiny_checkpoint, world_model, episodes=20)
     trainer = replace(config.trainer, updates=n)
     config = replace(config, rollout=replace(config.rollout, workers=2), trainer=trainer)
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
@@ -199,7 +199,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     last = history[-1]
     assert last.rollout["restarts"] == 1.0
     assert last.version == n == len(updates(history))
-    assert 0 < sum(e.plan.source == REAL for p in history for e in p.episodes) <= n, "it ends by its updates"
+    assert 0 < sum(e.plan.source == REAL for p in history for e in p.episodes) <= 20, "it ends by its updates"
     assert last.world_model["learn_episodes"] > 0 and last.world_model["version"] > 0
     assert 0 < last.replay["trained_imagined"] < last.replay["trained_decisions"]
     explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
