@@ -36,9 +36,9 @@ from accerl_lerobot.world_model.config import (
     OnlineLearnConfig,
     PixelModelConfig,
 )
-from accerl_lerobot.world_model.contract import WorldModelSpec, load_episodes, new_model
-from accerl_lerobot.world_model.imagined import World, check_imagination, load_world, read_content, save_world
-from accerl_lerobot.world_model.online import ONLINE, make_learner
+from accerl_lerobot.world_model.contract import WorldModelSpec, load_episodes
+from accerl_lerobot.world_model.imagined import check_imagination, load_world, new_world, save_world
+from accerl_lerobot.world_model.training import ONLINE, make_trainer
 from tests.policies.checkpoints import write_diffusion
 from tests.runs import drive, local_engine, polls, tiny_run, trained, updates
 from tests.tiny_datasets import one_process, record_dataset
@@ -48,21 +48,20 @@ ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
 
 
 SPEC = WorldModelSpec(
-    cameras=("observation.images.front",), image_size=(32, 32), state_dim=4, action_dim=2, chunk=4, context=2,
-    fps=80,
+    cameras=("observation.images.front",), image_size=(32, 32), state_dim=4, action_dim=2, chunk=4, fps=80,
 )  # fmt: skip
 
 
-def new_world(folder: Path, config: LearnableModelConfig, **content: Any) -> Path:
+def saved_world(folder: Path, config: LearnableModelConfig, **content: Any) -> Path:
     """A world that has learnt nothing."""
     torch.manual_seed(0)
-    save_world(folder, World(new_model(replace(SPEC, context=config.context), config)), **content)
+    save_world(folder, new_world(SPEC, config, tasks=["Match the target"], **content))
     return folder
 
 
 @pytest.fixture(scope="module")
 def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return new_world(tmp_path_factory.mktemp("world") / "world_model", PixelModelConfig(channels=(8, 8)))
+    return saved_world(tmp_path_factory.mktemp("world") / "world_model", PixelModelConfig(channels=(8, 8)))
 
 
 def imagining(
@@ -178,8 +177,8 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engines.ray_engine import RayEngine
 
-    n = 20
-    config = imagining(tiny_checkpoint, world_model, episodes=n)
+    n = 80  # so many that some are left when the process is missed, on a busy machine too
+    config = imagining(tiny_checkpoint, world_model, episodes=20)
     trainer = replace(config.trainer, updates=n)
     config = replace(config, rollout=replace(config.rollout, workers=2), trainer=trainer)
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
@@ -200,7 +199,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     last = history[-1]
     assert last.rollout["restarts"] == 1.0
     assert last.version == n == len(updates(history))
-    assert 0 < sum(e.plan.source == REAL for p in history for e in p.episodes) <= n, "it ends by its updates"
+    assert 0 < sum(e.plan.source == REAL for p in history for e in p.episodes) <= 20, "it ends by its updates"
     assert last.world_model["learn_episodes"] > 0 and last.world_model["version"] > 0
     assert 0 < last.replay["trained_imagined"] < last.replay["trained_decisions"]
     explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
@@ -209,7 +208,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     spent = read_timeline(tmp_path).shares()
     assert {"compute", "wait_in"} <= spent["world-model learning"].keys()
     saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / ONLINE)
-    assert saved["trainer"]["count"] >= last.world_model["learn_steps"]
+    assert saved["version"] >= last.world_model["learn_steps"]
 
 
 def test_what_does_not_fit_is_refused_before_the_run_begins(
@@ -221,7 +220,8 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
     for changed, line in (
         (replace(config, env=replace(ENV, reward="dense")), "env.reward='dense': use success with"),
         (replace(config, env=replace(ENV, environment_state=True)), "state=True: no policy reads it"),
-        (replace(config, policy=replace(config.policy, n_action_steps=2)), "one with world_model.chunk=2"),
+        (replace(config, policy=replace(config.policy, n_action_steps=2)), "chunk, and this run's is 2"),
+        (replace(config, rollout=replace(config.rollout, segment_length=3)), "length=3: use 4 or more"),
         (replace(config, policy=replace(config.policy, path=back)), "policy.n_obs_steps=2: the policy looks"),
         (replace(config, imagination=nowhere), "imagination.path='nowhere': config.json: is missing"),
     ):
@@ -236,33 +236,29 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
 ):
     dataset = record_dataset(tmp_path / "demos", ENV, episodes=6, failure_share=0.5)
     keys = [episode.key for episode in load_episodes(dataset, SPEC)]
-    for learnt, expected in ((keys[1:4], keys[1:4]), (["elsewhere"], None)):
-        path = new_world(tmp_path / str(len(learnt)), PixelModelConfig(channels=(8, 8)), learnt=learnt)
+
+    def with_dataset(learnt: list[str], **changes: str) -> RunConfig:
+        path = saved_world(tmp_path / learnt[0], PixelModelConfig(channels=(8, 8)), learnt=learnt)
         config = imagining(tiny_checkpoint, path)
-        learn = replace(config.imagination.learn, dataset=dataset)
-        config = replace(config, imagination=replace(config.imagination, learn=learn))
-        if expected is None:
-            with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.repo_id='a/b': the world"):
-                make_learner(config)
-        else:
-            assert [episode.key for episode in make_learner(config)._offline] == expected
-    nowhere = replace(learn, dataset=replace(dataset, root="nowhere"))
-    config = replace(config, imagination=replace(config.imagination, learn=nowhere))
+        learn = replace(config.imagination.learn, dataset=replace(dataset, **changes))
+        return replace(config, imagination=replace(config.imagination, learn=learn))
+
+    trainer = make_trainer(with_dataset(keys[1:4]))
+    assert list(dict.fromkeys(start.episode.key for start in trainer._recorded)) == keys[1:4]
+    with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.repo_id='a/b': the world"):
+        make_trainer(with_dataset(["elsewhere"]))
     with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.root='nowhere': no meta/info.json"):
-        check_imagination(config)
+        check_imagination(with_dataset(keys[:1], root="nowhere"))
 
 
-@pytest.mark.parametrize(
-    ("failed", "told"), [(None, "was never checked"), (["auroc"], "failed checks (auroc)"), ([], None)]
-)
-def test_of_a_world_model_that_has_not_passed_a_run_warns(
-    failed: list[str] | None, told: str | None, tiny_checkpoint: Path, tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-):  # fmt: skip
-    path = new_world(tmp_path / "w", PixelModelConfig(channels=(8, 8)), failed_checks=failed)
+def test_a_run_warns_of_a_world_model_that_has_failed_a_check(
+    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    check_imagination(imagining(tiny_checkpoint, world_model))
+    assert not caplog.messages
+    path = saved_world(tmp_path / "w", PixelModelConfig(channels=(8, 8)), failed_checks=["auroc"])
     check_imagination(imagining(tiny_checkpoint, path))
-    warnings = [text for text in caplog.messages if "the world model of" in text]
-    assert bool(warnings) == (told is not None) and all(str(told) in text for text in warnings)
+    assert [text for text in caplog.messages if "failed checks (auroc)" in text]
 
 
 def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
@@ -270,7 +266,7 @@ def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
 ):
     package = "tests.world_model.linear_world"
     linear = importlib.import_module(package).LinearModelConfig
-    path = new_world(tmp_path / "w", linear(gain=3.0))
+    path = saved_world(tmp_path / "w", linear(gain=3.0))
     LearnableModelConfig.get_known_choices().pop("linear")
     sys.modules.pop(package)
     config = imagining(tiny_checkpoint, path, episodes=24)
@@ -309,9 +305,9 @@ def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
     assert "episodes of play" not in capsys.readouterr().err, "they are there"
     assert summary["updates"] == 12 and summary["imagined_episodes"] > 0
     assert summary["episodes_explored"] == 6 and summary["imagined_decisions"] > 0
-    learnt = read_content(tmp_path / "pretraining" / "world_model")["learnt"]
+    learnt = load_world(tmp_path / "pretraining" / "world_model").learnt
     assert {episode.key for episode in recorded} > set(learnt)
-    saved = read_content(tmp_path / "checkpoints" / "last" / WORLD_MODEL)["learnt"]
+    saved = load_world(tmp_path / "checkpoints" / "last" / WORLD_MODEL).learnt
     assert len(saved) == len(learnt) + 6, "and the real episodes of the run"
 
 

@@ -31,7 +31,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.timeline import TimelineConfig
-from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import PixelModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.machinery import MachineryConfig
 from benchmarks.scaling import BenchScalingConfig
@@ -97,7 +97,6 @@ RULES = [
         "trainer.ranks=9: use at most trainer.batch_decisions, 8",
     ),
     (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),
-    (WorldModelConfig, {"image_size": 60}, "world_model.image_size="),
 ]
 
 

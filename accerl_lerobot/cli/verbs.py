@@ -216,7 +216,7 @@ def _checked(
 
     found, directory, console = _in_new_folder(config, work)
     show(found, directory, console)
-    return tell(found, 0 if found["passed"] else 1)
+    return tell(found, 1 if found["failed"] else 0)
 
 
 def push(arguments: list[str]) -> int:

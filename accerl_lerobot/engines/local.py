@@ -78,14 +78,14 @@ class LocalEngine(Engine):
         self._world_learner: Any = None
         if config.imagination.environments:
             from accerl_lerobot.world_model.imagined import imagined_environments
-            from accerl_lerobot.world_model.online import make_learner
+            from accerl_lerobot.world_model.training import make_trainer
 
             imagined = config.imagination.environments * config.rollout.workers
             spec = environments[0].spec
             self._world, more = imagined_environments(config.imagination, imagined, spec, starts)
             environments += more
             if config.imagination.learns:
-                self._world_learner = make_learner(config)
+                self._world_learner = make_trainer(config)
         self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
         self._runner = RolloutRunner(
             environments, self._next, config.rollout, "local", self._outbox.append, self._end, starts
@@ -146,7 +146,7 @@ class LocalEngine(Engine):
         snapshot.save(state / self.state_name, engine)
         if self._world_learner is not None:
             from accerl_lerobot.checkpoint.tensors import copied
-            from accerl_lerobot.world_model.online import ONLINE, save_online
+            from accerl_lerobot.world_model.training import ONLINE, save_online
 
             acting = {"version": self._world.version, "weights": copied(self._world)}
             snapshot.save(state / ONLINE, {"learner": self._world_learner.state(), "acting": acting})
@@ -164,7 +164,7 @@ class LocalEngine(Engine):
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
         if self._world_learner is not None:
-            from accerl_lerobot.world_model.online import ONLINE
+            from accerl_lerobot.world_model.training import ONLINE
 
             saved = snapshot.load(directory / ONLINE)
             self._world_learner.restore(saved["learner"])
@@ -219,7 +219,7 @@ class LocalEngine(Engine):
             return
         learner.step()
         if learner.pending_steps < 1:
-            self._world.load(learner.version, learner.world.state_dict())
+            self._world.load(learner.serving.version, learner.serving.state_dict())
 
     def _store(self) -> None:
         while self._outbox and self._replay.may_insert():

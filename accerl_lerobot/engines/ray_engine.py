@@ -266,7 +266,7 @@ class RayEngine(Engine):
             learning = (config.seed, config.trainer.num_threads, timeline)
             world_model = add(WORLD_MODEL_WORKER, "world_model", WorldModelWorker, 4, *learning).actor
         if config.imagination.learns:
-            from accerl_lerobot.world_model.online import OnlineLearningWorker
+            from accerl_lerobot.world_model.training import OnlineLearningWorker
 
             self._world_learner = add(
                 WORLD_LEARNING, "world_model", OnlineLearningWorker, 4, config, state, timeline
@@ -282,6 +282,8 @@ class RayEngine(Engine):
         for worker, reference in zip(workers, ready, strict=True):
             worker.pid = worker.result(reference, "ready", START_S)
         self._replay.work = self._replay.actor.run.remote()
+        if self._world_learner is not None:
+            self._world_learner.work = self._world_learner.actor.run.remote()
         for slot in self._rollouts:
             replica = self._inference[slot.index % len(self._inference)]
             slot.services = (replica.endpoint, self._replay.endpoint)

@@ -16,7 +16,7 @@
 
 The four are processes in `ray_engine`, and take turns in one process in `local`. Where a world model learns
 in the run, it has a process too: `world_model.worker` for the state of critic and teacher,
-`world_model.online` for imagined environments, which rollout workers step like real ones.
+`world_model.training` for imagined environments, which rollout workers step like real ones.
 """
 
 from __future__ import annotations

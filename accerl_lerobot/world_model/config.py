@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
@@ -12,7 +11,6 @@ import draccus
 from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
 
-SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in the network of `PixelModelConfig`
 WORLD_LEARNING = "world-model learning"  # name of the worker that trains the pixel world model
 
 
@@ -90,15 +88,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
     make: ClassVar[str]
     """``module:name`` of the class, which is built from a `contract.WorldModelSpec` and this config."""
 
-    context: Annotated[int, Range("[1, 1000]")] = 2
-    """Frames the model sees, the newest included, a chunk apart."""
-
     type = registered_name
-
-    @property
-    def multiple(self) -> int:
-        """Number that image sides must be a multiple of."""
-        return 1
 
 
 @LearnableModelConfig.register_subclass("pixels")
@@ -117,10 +107,6 @@ class PixelModelConfig(LearnableModelConfig):
         if not self.channels:
             raise InputError("world_model.model.channels", self.channels, "name at least one width")
 
-    @property
-    def multiple(self) -> int:
-        return SPACE_TO_DEPTH * 2 ** (len(self.channels) - 1)
-
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelConfig(Section, section="world_model"):
@@ -137,13 +123,6 @@ class WorldModelConfig(Section, section="world_model"):
     """Height and width in pixels of the predicted frames."""
     chunk: Annotated[int, Range("[1, 10000]")] = 10
     """Env steps per prediction: the actions a policy executes per decision."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        multiple = math.lcm(2, self.model.multiple)  # the success model halves it first
-        if self.image_size % multiple:
-            hint = f"use a multiple of {multiple}, or change world_model.model"
-            raise InputError("world_model.image_size", self.image_size, hint)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ An imagined episode begins at the first observation of a real one. Each chunk is
 model. The episode ends with the success model's first success, or at the time limit.
 
 world_model/
-  config.json          spec, config of the model, keys of the episodes it was trained on, checks it failed
+  config.json          spec, config of the model, tasks and keys of its episodes, checks that it failed
   model.safetensors    weights and statistics of both models
 
 Shapes: V cameras, H×W pixels, S robot state dims, K env steps of a chunk, A action dims.
@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Collection
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,14 +28,16 @@ from safetensors.torch import save_file
 from torch import nn
 
 from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, safe_join
-from accerl_lerobot.config.parsing import DISCOVER, discover
+from accerl_lerobot.checkpoint.tensors import copied
+from accerl_lerobot.config.parsing import DISCOVER, discover, imported
 from accerl_lerobot.demos.record import make_expert
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
-from accerl_lerobot.errors import InputError, expanded, in_one_line
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
 from accerl_lerobot.policies.config import executed_rows
-from accerl_lerobot.policies.untrusted import Unfilled, input_error
+from accerl_lerobot.policies.features import STATE
+from accerl_lerobot.policies.untrusted import refusing
 from accerl_lerobot.rollout.runner import Starts, start_of
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
@@ -48,8 +50,8 @@ from accerl_lerobot.world_model.contract import (
     check_dataset,
     cut_windows,
     model_arrays,
-    new_model,
     resize,
+    spec_of,
 )
 from accerl_lerobot.world_model.pixels import SuccessModel
 
@@ -60,17 +62,29 @@ logger = logging.getLogger(__name__)
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
-LEARN = "imagination.learn.dataset"
 
 
 class World(nn.Module):
     """World model and success model, which all imagined environments of a process share."""
 
-    def __init__(self, model: LearnableWorldModel) -> None:
+    def __init__(
+        self,
+        model: LearnableWorldModel,
+        tasks: Sequence[str] = (),
+        learnt: Sequence[str] = (),
+        failed_checks: Sequence[str] = (),
+    ) -> None:
         super().__init__()
         self.model = model
-        self.success = SuccessModel()
+        self.success = SuccessModel(len(model.spec.cameras))
         self.version = 0  # gradient steps that they have made in the run
+        self.tasks = list(tasks)  # instructions of the episodes it was trained on
+        self.learnt = list(learnt)  # keys of these episodes
+        self.failed_checks = list(failed_checks)
+
+    @property
+    def device(self) -> torch.device:
+        return self.success.threshold.device
 
     def begin(self, frames: np.ndarray, robot: np.ndarray, task: str) -> State:
         """The model's state at the start of an episode, uint8 (V, H, W, 3) and float32 (S,)."""
@@ -78,23 +92,22 @@ class World(nn.Module):
             frames=frames[None],
             times=np.zeros(1, np.int64),
             state=robot[None],
-            actions=np.zeros((0, self.model.spec.action_dim), np.float32),
-            success_at=-1,
+            actions=np.zeros((1, self.model.spec.action_dim), np.float32),
+            success=False,
             task=task,
         )
-        context = cut_windows([start], [WindowStart(0, 0)], self.model.spec, chunks=0).context
+        context = cut_windows([WindowStart(start, 0)], self.model.spec).context
         return self.model.begin(context, [task])
 
     @torch.no_grad()
-    def step(self, state: State, actions: np.ndarray, seed: int) -> Prediction:
+    def step(self, state: State, actions: np.ndarray) -> Prediction:
         """Predicts one chunk of actions, float32 (K, A)."""
-        return self.model.step(state, torch.from_numpy(actions[None]), [seed])
+        return self.model.step(state, torch.from_numpy(actions[None]))
 
     def succeeds(self, frames: np.ndarray, task: str) -> bool:
         """True if the frames, uint8 (V, H, W, 3), show the task achieved."""
         codes = torch.from_numpy(task_codes([task]))
-        batch = torch.from_numpy(frames[None])
-        [probability] = self.success.probabilities(batch, codes)
+        [probability] = self.success.probabilities(torch.from_numpy(frames[None]), codes)
         return bool(probability > self.success.threshold)
 
     def load(self, version: int, weights: dict[str, Any]) -> None:
@@ -103,33 +116,24 @@ class World(nn.Module):
         self.version = version
 
 
-def save_world(
-    directory: Path, world: World, learnt: Collection[str] = (), failed_checks: Collection[str] | None = None
-) -> None:
-    """Writes a new folder. `learnt` are keys of episodes; `failed_checks` None: it has not been checked."""
+def new_world(spec: WorldModelSpec, config: LearnableModelConfig, **content: Sequence[str]) -> World:
+    """An untrained world, with a model of the class that `config` names."""
+    return World(imported(config.make)(spec, config), **content)
+
+
+def save_world(directory: Path, world: World) -> None:
+    """Writes a new folder."""
     directory.mkdir(parents=True)
-    if failed_checks is not None:
-        failed_checks = list(failed_checks)
     content = {
         "spec": asdict(world.model.spec),
         "model": draccus.encode(world.model.config, LearnableModelConfig),
-        "learnt": sorted(learnt),
-        "failed_checks": failed_checks,
+        "tasks": world.tasks,
+        "learnt": world.learnt,
+        "failed_checks": world.failed_checks,
     }
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
-    # Copies, as safetensors refuses tensors that share memory.
-    weights = {k: v.clone(memory_format=torch.contiguous_format) for k, v in world.state_dict().items()}
+    weights = {name: tensor.contiguous() for name, tensor in copied(world).items()}
     save_file(weights, directory / WEIGHTS)
-
-
-def read_content(directory: Path, section: str = "") -> dict[str, Any]:
-    """The config file that `save_world` wrote; errors name the config `section`."""
-    origin = _origin(directory, section)
-    content = read_json(safe_join(directory, CONFIG, origin), origin)
-    for name in ("learnt", "failed_checks"):
-        if not isinstance(content.get(name) or [], list):
-            raise origin.refuse(f"{CONFIG}: {name}", "not one of accerl world-model")
-    return content
 
 
 def load_world(directory: Path, package: str | None = None, *, section: str = "") -> World:
@@ -137,32 +141,18 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
 
     `package` registers the model's type, where that is not one of ours; errors name the config `section`.
     """
-    origin = _origin(directory, section)
+    prefix = f"{section}." if section else ""
+    origin = FileSource(f"{prefix}path", str(directory))
     discover(package, section)
-    content = read_content(directory, section)
+    content = read_json(safe_join(directory, CONFIG, origin), origin)
     weights = safe_join(directory, WEIGHTS, origin)
-    try:
-        spec = draccus.decode(WorldModelSpec, content.get("spec"))
-        config = draccus.decode(LearnableModelConfig, content.get("model"))
-        with Unfilled():
-            world = World(new_model(spec, config))
+    what = "not a world model of accerl world-model; if its type is of another package, name that: "
+    with refusing(origin, f"{what}{prefix}{DISCOVER}"):
+        spec = draccus.decode(WorldModelSpec, content.pop("spec"))
+        config = draccus.decode(LearnableModelConfig, content.pop("model"))
+        world = new_world(spec, config, **content)
         world.load_state_dict(dict(read_tensors(weights, origin)))
-    except Exception as error:  # the files may hold anything
-        refusal = input_error(error)  # draccus wraps what a config refuses
-        if refusal is not None and refusal.field == origin.field:
-            raise refusal from error
-        if refusal is not None:
-            raise origin.refuse(CONFIG, str(refusal)) from error
-        package = origin.field.removesuffix("path") + DISCOVER
-        hint = f"not a world model of accerl world-model ({in_one_line(error)}); "
-        hint += f"if its type is of another package, name that: {package}"
-        raise InputError(origin.field, origin.value, hint) from error
     return world.requires_grad_(False).eval()
-
-
-def _origin(directory: Path, section: str) -> FileSource:
-    field = f"{section}.path" if section else "path"
-    return FileSource(field, str(directory))
 
 
 class ImaginedEnvironment(Environment):
@@ -179,10 +169,7 @@ class ImaginedEnvironment(Environment):
         self._world = world
         self._starts = starts
         self._task = ""
-        self._seed = 0
         self._steps = 0
-        self._done = True
-        self._frames = np.zeros((0, 0, 0, 3), np.uint8)
         self._state: State = {}
 
     def reset(self, seed: int, task: str) -> Observation:
@@ -190,65 +177,50 @@ class ImaginedEnvironment(Environment):
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         [frames], [robot] = model_arrays(arrays, self._world.model.spec)
         self._task = str(first[TASK])
-        self._seed = seed
         self._steps = 0
-        self._done = False
-        self._frames = frames
         self._state = self._world.begin(frames, robot, self._task)
-        return self._observation(robot)
+        return self._observation(frames, robot)
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
         actions = checked_actions(actions, self.spec)
-        seed = int(np.random.default_rng((self._seed, self._steps)).integers(2**31))
-        prediction = self._world.step(self._state, actions, seed)
+        prediction = self._world.step(self._state, actions)
         self._state = prediction.state
-        self._frames = prediction.frames[0].cpu().numpy()
-        success = self._world.succeeds(self._frames, self._task)
+        frames = prediction.frames[0].numpy()
+        success = self._world.succeeds(frames, self._task)
         self._steps += len(actions)
-        late = self._steps >= self.spec.max_steps
-        self._done = success or late
         rewards = np.zeros(len(actions), np.float32)
         rewards[-1] = float(success)
         return ChunkResult(
-            observation=self._observation(prediction.robot[0].cpu().numpy()),
+            observation=self._observation(frames, prediction.robot[0].numpy()),
             rewards=rewards,
             terminated=success,
-            truncated=late and not success,
+            truncated=not success and self._steps >= self.spec.max_steps,
             success=success,
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
-        return resize(self._frames[:1], (height, width))[0]
+        raise NotImplementedError("imagined episodes are not filmed")
 
     def state(self) -> Any:
-        names = ("_task", "_seed", "_steps", "_done", "_frames", "_state")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in ("_task", "_steps", "_state")}
 
     def restore(self, state: Any) -> None:
         vars(self).update(state)
 
-    def _observation(self, robot: np.ndarray) -> Observation:
-        """Observation of the newest frames, in the sizes of the real environment."""
+    def _observation(self, frames: np.ndarray, robot: np.ndarray) -> Observation:
+        """Observation of frames uint8 (V, H, W, 3), in the sizes of the real environment."""
         observation: Observation = {TASK: self._task}
-        for v, camera in enumerate(self._world.model.spec.cameras):
-            if camera in self.spec.images:
-                size = self.spec.images[camera][:2]
-                observation[camera] = resize(self._frames[v : v + 1], size)[0]
+        for frame, (camera, shape) in zip(frames, self.spec.images.items(), strict=True):
+            observation[camera] = resize(frame[None], shape[:2])[0]
         if self.spec.state_dim:
-            observation["observation.state"] = robot.astype(np.float32)
+            observation[STATE] = robot
         return observation
-
-
-def world_path(config: ImaginationConfig) -> Path:
-    """The folder that ``imagination.path`` names."""
-    return expanded(str(config.path), "imagination.path")
 
 
 def world_of(config: ImaginationConfig) -> World:
     """The world that ``imagination.path`` has."""
-    return load_world(world_path(config), config.discover_packages_path, section="imagination")
+    path = expanded(str(config.path), "imagination.path")
+    return load_world(path, config.discover_packages_path, section="imagination")
 
 
 def imagined_environments(
@@ -259,6 +231,15 @@ def imagined_environments(
     return world, [ImaginedEnvironment(world, spec, starts) for _ in range(count)]
 
 
+@contextmanager
+def about_learning() -> Iterator[None]:
+    """Puts ``imagination.learn`` into errors about that dataset."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"imagination.learn.{error.field}", error.value, error.hint) from error
+
+
 def check_imagination(config: RunConfig) -> None:
     """Refuses, before a run begins, what imagined episodes cannot have, and a world model that does not fit.
 
@@ -267,6 +248,7 @@ def check_imagination(config: RunConfig) -> None:
     from accerl_lerobot.run.preflight import policy_to_be
 
     policy = policy_to_be(config)
+    executed = executed_rows(policy)
     imagination = config.imagination
     reward = getattr(config.env, "reward", "success")
     if reward != "success":
@@ -288,39 +270,34 @@ def check_imagination(config: RunConfig) -> None:
         if imagination.path is None:
             for task in spec.tasks[: imagination.expert_episodes]:
                 make_expert(config.env, environment, task)
-            return
-    world = world_of(imagination)
-    _check_fit(world.model.spec, spec, executed_rows(policy))
-    if imagination.learns and imagination.learn.dataset.repo_id is not None:
-        check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
-    failed = read_content(world_path(imagination), "imagination").get("failed_checks")
-    if failed == []:
-        return
-    why = "was never checked"
-    if failed is not None:
-        why = f"failed checks ({', '.join(map(str, failed))})"
-    text = "the world model of imagination.path=%s %s; train it longer or on more episodes"
-    logger.warning(text, imagination.path, why)
+    if imagination.path is not None:
+        _check_world(imagination, spec, executed)
+    decisions = -(-spec.max_steps // executed)
+    if imagination.learns and config.rollout.segment_length < decisions:
+        hint = f"use {decisions} or more: the world model learns from segments that are whole episodes"
+        raise InputError("rollout.segment_length", config.rollout.segment_length, hint)
 
 
-def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
+def _check_world(config: ImaginationConfig, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses a world model that does not fit environment and policy, which executes so many actions per
-    decision."""
+    decision, or that could not go on learning."""
     field = "imagination.path"
-    again = "train one of this environment"
-    shown = tuple(environment.images)
-    for camera in sorted({*shown} ^ {*spec.cameras}):
-        hint = f"the environment shows {shown!r}, the world model {spec.cameras!r}; {again}"
-        raise InputError(field, camera, hint)
-    for name in ("state_dim", "action_dim", "fps"):
-        modelled = getattr(spec, name)
-        real = getattr(environment, name)
+    world = world_of(config)
+    needed = spec_of(environment, 0, executed)
+    for name in ("cameras", "state_dim", "action_dim", "fps", "chunk"):
+        modelled = getattr(world.model.spec, name)
+        real = getattr(needed, name)
         if modelled != real:
-            hint = f"is the world model's {name}, and the environment's is {real}; {again}"
+            hint = f"is the world model's {name}, and this run's is {real}; train one for this run"
             raise InputError(field, modelled, hint)
     for text in environment.instructions:
-        if spec.tasks and text not in spec.tasks:
-            raise InputError(field, text, f"the world model was trained on {spec.tasks!r}; {again}")
-    if spec.chunk != executed:
-        hint = f"env steps per prediction, and the policy executes {executed} actions per decision"
-        raise InputError(field, spec.chunk, f"{hint}; train one with world_model.chunk={executed}")
+        if text not in world.tasks:
+            hint = f"the world model was trained on {world.tasks!r}; train one for this run"
+            raise InputError(field, text, hint)
+    if config.learns and config.learn.dataset.repo_id is not None:
+        with about_learning():
+            check_dataset(config.learn.dataset, world.model.spec)
+    if world.failed_checks:
+        failed = ", ".join(world.failed_checks)
+        text = "the world model of imagination.path=%s failed checks (%s); train it on more episodes"
+        logger.warning(text, config.path, failed)

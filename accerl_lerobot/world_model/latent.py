@@ -84,11 +84,12 @@ class LatentModel(StateModel):
         if not spec.cameras:
             hint = "the policy reads no images; use simulator, or another algorithm"
             raise InputError("world_model.type", config.type, hint)
-        channels = sum(spec.cameras.values())
         rows, dims = spec.chunk
         chunk = rows * dims
         seen = config.latents + spec.state
         self.cameras = tuple(spec.cameras)
+        self.channels = list(spec.cameras.values())
+        channels = sum(self.channels)
         self.latents = config.latents
         self.size = seen + 1
         self.encoder = Encoder(channels, config.latents)
@@ -104,8 +105,7 @@ class LatentModel(StateModel):
         self.std = fixed(torch.ones(spec.state))
 
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
-        images = self._scaled(self._images(observations))
-        latent = self.encoder(torch.cat(images, 1))
+        latent = self.encoder(self._scaled(self._images(observations)))
         late = torch.from_numpy(elapsed.astype(np.float32))[:, None].to(latent)
         return torch.cat([latent, self._proprioception(observations), late], 1)
 
@@ -123,7 +123,7 @@ class LatentModel(StateModel):
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
         follow(self.slow, self.encoder, FOLLOW)
         images = self._images(transitions.observations)
-        self._fit_pixels(torch.cat(images, 1))
+        self._fit_pixels(images)
         now = self._scaled(images)
         following = self._scaled(self._images(transitions.following))
         robot = self._robot(transitions.observations)
@@ -131,10 +131,10 @@ class LatentModel(StateModel):
         code = torch.from_numpy(task_codes(transitions.tasks)).to(robot)
         chunk = transitions.chunk.flatten(1)
 
-        seen = torch.cat([self.encoder(augmented(now)), robot], 1)
-        seen_then = torch.cat([self.encoder(augmented(following)), robot_then], 1)
+        seen = torch.cat([self.encoder(self._augmented(now)), robot], 1)
+        seen_then = torch.cat([self.encoder(self._augmented(following)), robot_then], 1)
         with torch.no_grad():
-            latent_then = self.slow(augmented(following))
+            latent_then = self.slow(self._augmented(following))
 
         predicted = seen + self.dynamics(torch.cat([seen, chunk, code], 1))
         contrast = info_nce(predicted[:, : self.latents], latent_then)
@@ -163,20 +163,19 @@ class LatentModel(StateModel):
         self.pixel_mean.lerp_(images.mean(0), rate)
         self.pixel_square.lerp_(images.square().mean(0), rate)
 
-    def _scaled(self, cameras: Sequence[Tensor]) -> list[Tensor]:
-        """The images of each camera in units of what each pixel varies by."""
+    def _scaled(self, images: Tensor) -> Tensor:
+        """Images (B, channels, 64, 64) in units of what each pixel varies by."""
         variance = self.pixel_square - self.pixel_mean.square()
         std = variance.clamp(min=SMALLEST_PIXEL_STD**2).sqrt()
-        channels = [images.shape[1] for images in cameras]
-        means = self.pixel_mean.split(channels)
-        scaled = []
-        for images, mean, scale in zip(cameras, means, std.split(channels), strict=True):
-            deviations = (images - mean) / scale
-            scaled.append(deviations.clamp(-FARTHEST, FARTHEST))
-        return scaled
+        return ((images - self.pixel_mean) / std).clamp(-FARTHEST, FARTHEST)
 
-    def _images(self, observations: Observations) -> list[Tensor]:
-        """Each camera's, float (B, C, 64, 64) in [−½, ½]; of several env steps the newest."""
+    def _augmented(self, images: Tensor) -> Tensor:
+        """Images (B, channels, 64, 64), those of each camera shifted by themselves."""
+        cameras = [shifted(part) for part in images.split(self.channels, 1)]
+        return torch.cat(cameras, 1).contiguous(memory_format=torch.channels_last)  # CPUs convolve it faster
+
+    def _images(self, observations: Observations) -> Tensor:
+        """All cameras', float (B, channels, 64, 64) in [−½, ½]; of several env steps the newest."""
         cameras = []
         for name in self.cameras:
             pixels = observations[name]
@@ -187,7 +186,7 @@ class LatentModel(StateModel):
             if image.shape[-2:] != (SIDE, SIDE):
                 image = functional.interpolate(image, (SIDE, SIDE), mode="area")
             cameras.append(image / 255 - 0.5)
-        return cameras
+        return torch.cat(cameras, 1)
 
     def _robot(self, observations: Observations) -> Tensor:
         """Proprioception in standard deviations from its mean, (B, numbers)."""
@@ -215,12 +214,6 @@ def info_nce(predicted: Tensor, observed: Tensor) -> Tensor:
     similarity = functional.normalize(predicted, dim=1) @ functional.normalize(observed, dim=1).T
     own = torch.arange(len(predicted), device=predicted.device)
     return functional.cross_entropy(similarity / TEMPERATURE, own)
-
-
-def augmented(cameras: Sequence[Tensor]) -> Tensor:
-    """Images of several cameras, each shifted by itself, as one (B, channels, H, W)."""
-    images = torch.cat([shifted(images) for images in cameras], 1)
-    return images.contiguous(memory_format=torch.channels_last)  # CPUs convolve these faster
 
 
 def shifted(images: Tensor) -> Tensor:

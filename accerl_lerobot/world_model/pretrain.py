@@ -22,10 +22,8 @@ whole imagined episodes must end as the real ones did, as an imagined episode en
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,23 +42,22 @@ from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import (
     Episode,
-    Windows,
     WindowStart,
-    WorldModelSpec,
     cut_windows,
     load_episodes,
-    new_model,
     replay,
-    split_episodes,
-)  # fmt: skip
-from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
-from accerl_lerobot.world_model.training import Trainer, uniform, whole_windows
+    spec_of,
+    starts_of,
+)
+from accerl_lerobot.world_model.imagined import World, load_world, new_world, save_world
+from accerl_lerobot.world_model.training import Trainer
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.configs import WorldModelEvalRun
 
 LOG_EVERY = 20  # steps between two lines of training losses
 VALIDATION = "validation.json"
+HELD_OUT = 0.2  # share of the episodes that a world model is checked on
 BOUNDS = {"skill": 0.3, "sensitivity": 1.2, "auroc": 0.9}  # numbers that a world model must exceed
 MOST_WINDOWS = 400
 MOST_REPLAYS = 200
@@ -81,133 +78,120 @@ def pretrain(
     seed: int,
     device: str,
 ) -> dict[str, Any]:
-    """Trains, checks and saves a world model; `directory` exists.
-
-    Returns:
-        What `check` returns, with ``seconds`` of the training and the number of ``learnt`` episodes.
-    """
+    """Trains, checks and saves a world model; `directory` exists. Returns what `check` returns."""
     torch_device = resolve_device(device, "device")
     with closing(make_environment(env)) as environment:
-        sizes = environment.spec
-    spec = WorldModelSpec(
-        cameras=tuple(sizes.images), image_size=(config.image_size, config.image_size),
-        state_dim=sizes.state_dim, action_dim=sizes.action_dim, chunk=config.chunk,
-        context=config.model.context, fps=sizes.fps, labelled_fps=sizes.labelled_fps,
-    )  # fmt: skip
-    with console.stage("episodes"):
-        episodes = load_episodes(dataset, spec)
-    learnt, held_out = split_episodes(episodes, np.random.default_rng((seed, 0)))
-    for part in (learnt, held_out):
-        if {episode.success for episode in part} != {True, False}:
-            hint = "it needs at least two successes and two failures, to hold out one of each; record more"
-            raise InputError("dataset.repo_id", dataset.repo_id, hint)
-    spec = replace(spec, tasks=tuple(sorted({episode.task for episode in episodes})))
-    started = time.monotonic()
+        spec = spec_of(environment.spec, config.image_size, config.chunk)
     torch.manual_seed(seed)
     # The networks are initialised on the CPU, so alike on every device.
-    world = World(new_model(spec, config.model)).to(torch_device)
-    trainer = Trainer(world, config.lr, seed, config.steps)
-    weights = uniform(learnt)
-    trainer.fit_statistics(learnt)
+    world = new_world(spec, config.model).to(torch_device)
+    with console.stage("episodes"):
+        episodes = load_episodes(dataset, spec)
+    rng = np.random.default_rng(seed)
+    learnt: list[Episode] = []
+    held_out: list[Episode] = []
+    for outcome in (False, True):
+        of_outcome = shuffled([episode for episode in episodes if episode.success == outcome], rng)
+        if len(of_outcome) < 2:
+            hint = "it needs at least two successes and two failures, to hold out one of each; record more"
+            raise InputError("dataset.repo_id", dataset.repo_id, hint)
+        count = max(1, round(HELD_OUT * len(of_outcome)))
+        held_out += of_outcome[:count]
+        learnt += of_outcome[count:]
+    world.tasks = sorted({episode.task for episode in episodes})
+    world.learnt = sorted(episode.key for episode in learnt)
+    trainer = Trainer(world, learnt, config.lr, config.steps)
+    trainer.fit_statistics()
     with (
         console.stage("world model", total=config.steps) as stage,
         (directory / "metrics.jsonl").open("w") as log,
     ):
         for step in range(1, config.steps + 1):
-            metrics = trainer.step(learnt, weights)
+            metrics = trainer.step()
             stage.update(step, " ".join(f"{name} {value:.3f}" for name, value in metrics.items()))
             if step % LOG_EVERY == 0:
                 log.write(json.dumps({"step": step} | metrics) + "\n")
     world = trainer.serving
-    more = {"learnt": len(learnt), "seconds": time.monotonic() - started}
-    found = _validate(world, held_out, seed, directory, console, more)
+    found = _validate(world, held_out, seed, directory, console)
     world.success.threshold.fill_(found["threshold"])
-    failed = [name for name, outcome in found["checks"].items() if not outcome["holds"]]
-    save_world(directory / "world_model", world, [episode.key for episode in learnt], failed)
+    world.failed_checks = found["failed"]
+    save_world(directory / "world_model", world)
     return found
 
 
 def evaluate(run: WorldModelEvalRun, directory: Path, console: Console) -> dict[str, Any]:
     """Checks a saved world model on episodes that it was not trained on."""
     device = resolve_device(run.device, "device")
-    path = expanded(str(run.path), "path")
-    world = load_world(path, run.discover_packages_path).to(device)
-    learnt = read_content(path).get("learnt") or ()
+    world = load_world(expanded(str(run.path), "path"), run.discover_packages_path).to(device)
     with console.stage("episodes"):
         episodes = load_episodes(run.dataset, world.model.spec)
-    kept = [episode for episode in episodes if episode.key not in learnt]
+    kept = [episode for episode in episodes if episode.key not in world.learnt]
     if not kept:
         hint = "the world model was trained on every episode of it; give another dataset"
         raise InputError("dataset.repo_id", run.dataset.repo_id, hint)
-    return _validate(world, kept, run.seed, directory, console, {})
+    return _validate(world, kept, run.seed, directory, console)
 
 
 def _validate(
-    world: World,
-    episodes: Sequence[Episode],
-    seed: int,
-    directory: Path,
-    console: Console,
-    more: dict[str, Any],
+    world: World, episodes: Sequence[Episode], seed: int, directory: Path, console: Console
 ) -> dict[str, Any]:
-    """Check a world, and write the outcome, with `more` numbers, and the video."""
+    """Check a world, and write the outcome and the video."""
+    # Of a merged dataset not its first part, and the same for every order of the episodes.
+    ordered = sorted(episodes, key=lambda episode: episode.key)
+    chosen = shuffled(ordered, np.random.default_rng(seed))
     with console.stage("check"):
-        found = check(world, episodes, seed) | more
-        preview(directory / "preview.mp4", world, episodes)
+        found = check(world, chosen)
+        preview(directory / "preview.mp4", world, chosen[:PREVIEWED])
     write_atomically(directory / VALIDATION, json.dumps(plain(found), indent=2) + "\n")
     return found
 
 
+def shuffled(episodes: Sequence[Episode], rng: np.random.Generator) -> list[Episode]:
+    return [episodes[i] for i in rng.permutation(len(episodes))]
+
+
 def show(found: dict[str, Any], directory: Path, console: Console) -> None:
     """Show people the outcome of a check."""
-    for name, outcome in found["checks"].items():
-        line = f"{name} {outcome['value']:.2f}, to be above {outcome['above']:g}"
-        if not outcome["holds"]:
-            line += ", FAILED"
-        console.say(line)
-    verdict = "passed" if found["passed"] else "FAILED"
+    for name, bound in BOUNDS.items():
+        verdict = ", FAILED" if name in found["failed"] else ""
+        console.say(f"{name} {found[name]:.2f}, to be above {bound:g}{verdict}")
+    verdict = "FAILED" if found["failed"] else "passed"
     console.say(f"{verdict} on {found['episodes']} episodes; see {directory / 'preview.mp4'}")
 
 
-def check(world: World, episodes: Sequence[Episode], seed: int = 0) -> dict[str, Any]:
-    """Checks a world.
+def check(world: World, episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Checks a world on some of these episodes, whose order is by chance.
 
     Returns:
-        ``checks``: value, bound and outcome of each of the three numbers; ``passed``; ``threshold`` of the
-        success model, chosen on these episodes; numbers of ``episodes`` and ``env_steps``.
+        ``skill``, ``sensitivity``, ``auroc``; ``failed``, the names of those that are not above their bound;
+        ``threshold`` of the success model, chosen on these episodes; number of ``episodes``.
     """
-    rng = np.random.default_rng((seed, 1))
+    found: dict[str, Any] = skill_and_sensitivity(world, episodes)
+    scores, achieved = replay_scores(world, episodes[:MOST_REPLAYS])
+    found["auroc"] = auroc(scores, achieved)
+    # NaN passes nothing.
+    found["failed"] = [name for name, bound in BOUNDS.items() if not found[name] > bound]
+    found["threshold"] = choose_threshold(scores, achieved)
+    found["episodes"] = len(episodes)
+    return found
+
+
+def skill_and_sensitivity(world: World, episodes: Sequence[Episode]) -> dict[str, float]:
+    """Both numbers, on windows of one chunk, spread evenly over the episodes."""
     chunk = world.model.spec.chunk
     at = []
-    for e, episode in enumerate(episodes):
-        followed = np.flatnonzero(episode.times + chunk <= episode.times[-1])
-        at += [WindowStart(e, int(frame)) for frame in followed]
-    chosen = rng.permutation(len(at))[:MOST_WINDOWS]
-    values = {"skill": np.nan, "sensitivity": np.nan}
-    if len(chosen):
-        windows = cut_windows(episodes, [at[i] for i in chosen], world.model.spec, 1)
-        values = skill_and_sensitivity(world, windows)
-    replayed = sorted(rng.permutation(len(episodes))[:MOST_REPLAYS])  # of a merged dataset not its first part
-    scores, achieved = replay_scores(world, [episodes[i] for i in replayed])
-    values["auroc"] = auroc(scores, achieved)
-    checks = {}
-    for name, value in values.items():
-        bound = BOUNDS[name]
-        checks[name] = {"value": value, "above": bound, "holds": value > bound}  # NaN passes nothing
-    return {
-        "passed": all(outcome["holds"] for outcome in checks.values()),
-        "checks": checks,
-        "threshold": choose_threshold(scores, achieved),
-        "episodes": len(episodes),
-        "env_steps": sum(map(len, episodes)),
-    }
-
-
-def skill_and_sensitivity(world: World, windows: Windows) -> dict[str, float]:
-    """Both numbers, on the first chunk of windows."""
+    for start in starts_of(episodes):
+        times = start.episode.times
+        if times[start.frame] + chunk <= times[-1]:
+            at.append(start)
+    if not at:
+        return {"skill": np.nan, "sensitivity": np.nan}
+    at = at[:: 1 + len(at) // MOST_WINDOWS]
+    windows = cut_windows(at, world.model.spec, 1, world.device)
+    # They lie together by episode, so half of them further on is another episode's.
+    other = windows._replace(actions=windows.actions.roll(len(at) // 2, 0))
     recorded = windows.frames[:, 0]
     newest = windows.context.frames[:, -1]
-    other = replace(windows, actions=windows.actions[donors(windows.episode)])
     predicted = replay(world.model, windows)[:, 0]
     misled = replay(world.model, other)[:, 0]
     difference = (recorded.int() - newest.int()).abs()
@@ -225,24 +209,15 @@ def squared_errors(frames: Tensor, target: Tensor) -> Tensor:
     return (frames.float() - target.float()).square().mean(-1)
 
 
-def donors(episode: Tensor) -> Tensor:
-    """For each row another row, of another episode where no episode has more than half of the rows."""
-    order = torch.argsort(episode, stable=True)
-    largest = int(torch.bincount(episode).max())
-    chosen = torch.empty_like(order)
-    chosen[order] = order.roll(-largest)
-    return chosen
-
-
 def replay_scores(world: World, episodes: Sequence[Episode]) -> tuple[np.ndarray, np.ndarray]:
     """Highest P(success) in each episode's imagined replay, until it really ended, and the real outcome."""
-    at = [WindowStart(e, 0) for e in range(len(episodes))]
-    windows = whole_windows(episodes, at, world)
+    at = [WindowStart(episode, 0) for episode in episodes]
+    windows = cut_windows(at, world.model.spec, device=world.device)
     known = windows.known
     frames = replay(world.model, windows)
-    probabilities = torch.zeros(known.shape)
-    probabilities[known] = world.success.probabilities(frames[known], windows.known_tasks)
-    return probabilities.amax(1).numpy(), windows.success.any(1).numpy()
+    probabilities = torch.zeros(known.shape, device=known.device)
+    probabilities[known] = world.success.probabilities(frames[known], windows.known_codes)
+    return probabilities.amax(1).cpu().numpy(), np.array([episode.success for episode in episodes])
 
 
 def choose_threshold(scores: np.ndarray, achieved: np.ndarray) -> float:
@@ -281,12 +256,11 @@ def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
 
 def preview(video: Path, world: World, episodes: Sequence[Episode]) -> None:
     """Films recorded episodes in the first row, and their imagined replays in the second."""
-    previewed = episodes[:PREVIEWED]
-    at = [WindowStart(e, 0) for e in range(len(previewed))]
-    windows = whole_windows(previewed, at, world)
+    at = [WindowStart(episode, 0) for episode in episodes]
+    windows = cut_windows(at, world.model.spec, device=world.device)
     lines = []
     for frames in (windows.frames, replay(world.model, windows)):
         clips = frames.repeat_interleave(SCALE, 3).repeat_interleave(SCALE, 4)
         beside = torch.cat(list(clips.unbind(2)), dim=3)  # cameras beside each other
-        lines.append([list(clip) for clip in beside.numpy()])
+        lines.append([list(clip) for clip in beside.cpu().numpy()])
     write_video(video, lines, fps=FPS)

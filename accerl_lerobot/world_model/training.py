@@ -5,24 +5,50 @@ The world model trains on real frames only; its own predictions are input, never
 trains on frames after chunks of replayed episodes, recorded ones and those that the world model predicts
 from the executed actions, with the outcomes that the episodes really had. The weights that are used and saved
 are a moving average of those that are trained.
+
+During a run half of each batch is from the recorded episodes of the pre-training, half from the policy's own
+episodes: demonstrations do not show how the policy fails.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+import os
+import queue
+import threading
+from collections import deque
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
-from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.world_model.contract import Episode, Windows, WindowStart, cut_windows, replay
-from accerl_lerobot.world_model.imagined import World
+from accerl_lerobot import errors
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
+from accerl_lerobot.checkpoint.tensors import copied, follow, optimizer_state, restore_optimizer
+from accerl_lerobot.errors import InputError, step_if_finite
+from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.fault_points import fault_point
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
+from accerl_lerobot.world_model.config import WORLD_LEARNING
+from accerl_lerobot.world_model.contract import (
+    Episode,
+    Windows,
+    WindowStart,
+    cut_windows,
+    episode_of,
+    load_episodes,
+    replay,
+    starts_of,
+)
+from accerl_lerobot.world_model.imagined import World, about_learning, save_world, world_of
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engines.config import RunConfig
 
 BATCH = 16  # windows per gradient step
 CHUNKS = 2  # chunks of a window
@@ -34,78 +60,118 @@ AVERAGE = 0.99  # decay of the moving average of the weights
 STATISTICS_WINDOWS = 2048  # windows from which normalisation statistics are taken
 REPLAYED = 48  # episodes that are replayed at a time for the success model
 REFRESH_EVERY = 50  # gradient steps until others are
+ONLINE = "online_world_model"  # name of the trainer's part of a checkpoint
+ONLINE_LR = 3e-4  # learning rate during a run
+MEMORY = 400  # newest episodes of the run that are trained on
+MOST_PENDING = 16  # episodes whose steps may be due, where episodes come faster than it can train
 
 
-@kind
+@snapshot.kind
 class Labelled(NamedTuple):
     """N frames, with their tasks' codes and outcomes."""
 
     frames: Tensor  # uint8 (N, V, H, W, 3)
-    tasks: Tensor  # float32 (N, 16), see `experience.task_codes`
+    codes: Tensor  # float32 (N, 16), see `experience.task_codes`
     success: Tensor  # bool (N,)
 
 
 class Trainer:
-    """Trains a world; `serving` is the one to use.
+    """Trains a copy of `world`; `serving` is the one to use. Randomness is torch's global generator's.
 
     Args:
+        recorded: episodes that it begins with.
         steps: gradient steps over which the learning rate falls; None: it stays.
+        steps_per_episode: gradient steps that are due for each episode of `add`.
     """
 
-    def __init__(self, world: World, lr: float, seed: int, steps: int | None = None) -> None:
-        self.world = world.train().requires_grad_(True)
-        self.serving = copy.deepcopy(world).requires_grad_(False).eval()
-        self.count = 0
-        self.rng = np.random.default_rng((seed, 1))
+    def __init__(
+        self,
+        world: World,
+        recorded: Sequence[Episode],
+        lr: float,
+        steps: int | None = None,
+        steps_per_episode: float = 0.0,
+    ) -> None:
+        self.world = copy.deepcopy(world).train().requires_grad_(True)
+        self.serving = copy.deepcopy(world).eval().requires_grad_(False)
+        self.pending_steps = 0.0  # gradient steps that are due
+        self.played: deque[Episode] = deque(maxlen=MEMORY)
+        self._recorded = starts_of(recorded)
         self._lr = lr
         self._steps = steps
-        self._generator = torch.Generator().manual_seed(seed)
-        self._optimizer = torch.optim.AdamW(world.parameters(), lr=lr, weight_decay=WEIGHT_DECAY)
+        self._steps_per_episode = steps_per_episode
+        self._optimizer = torch.optim.AdamW(self.world.parameters(), lr=lr, weight_decay=WEIGHT_DECAY)
+        self._skipped_in_a_row = 0
         self._labelled: Labelled | None = None
 
-    def fit_statistics(self, episodes: Sequence[Episode]) -> None:
+    def fit_statistics(self) -> None:
         """Fits the statistics of a new model."""
-        weights = uniform(episodes)
-        self.world.model.fit_statistics(self._draw(episodes, weights, STATISTICS_WINDOWS))
+        windows = self._cut(draw(self._groups(), STATISTICS_WINDOWS), CHUNKS)
+        self.world.model.fit_statistics(windows)
         self.serving.load_state_dict(self.world.state_dict())
 
-    def step(self, episodes: Sequence[Episode], weights: np.ndarray) -> dict[str, float]:
-        """Makes a gradient step on episodes drawn by `weights`; returns the losses and ``grad_norm``.
+    def add(self, segment: Segment) -> None:
+        """Takes a segment of the run; one that is a whole real episode, and is new, is learned from."""
+        whole = segment.terminated and segment.origin.decision == 0
+        if segment.source != REAL or not whole:
+            return
+        episode = episode_of(segment, self.world.model.spec)
+        if episode.key in self.serving.learnt:
+            return
+        self.serving.learnt.append(episode.key)
+        self.played.append(episode)
+        due = self.pending_steps + self._steps_per_episode
+        self.pending_steps = min(due, max(1.0, MOST_PENDING * self._steps_per_episode))
+
+    def step(self) -> dict[str, float]:
+        """Makes a gradient step; returns the losses and ``grad_norm``.
 
         The success model is left out while there are only successes, or only failures.
         """
-        windows = self._draw(episodes, weights, BATCH)
-        loss, metrics = self.world.model.loss(windows, self._generator)
-        if self._labelled is None or self.count % REFRESH_EVERY == 0:
-            self._labelled = self._replayed(episodes, weights)
+        self.pending_steps -= 1
+        count = self.serving.version
+        windows = self._cut(draw(self._groups(), BATCH), CHUNKS)
+        loss, metrics = self.world.model.loss(windows)
+        if self._labelled is None or count % REFRESH_EVERY == 0:
+            self._labelled = self._replayed()
         if self._labelled is not None:
-            success_loss = self.world.success.loss(*self._halves(self._labelled), self._generator)
+            success_loss = self.world.success.loss(*balanced(self._labelled))
             metrics["success"] = success_loss.item()
             loss = loss + success_loss
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = clip_grad_norm_(self.world.model.parameters(), GRAD_CLIP).item()
         success_norm = clip_grad_norm_(self.world.success.parameters(), GRAD_CLIP).item()
-        if not math.isfinite(norm + success_norm):
-            raise FloatingPointError(
-                f"the world model's loss or gradient is not finite at step {self.count + 1}; "
-                "lower world_model.lr; in a run, use imagination.learn.steps_per_episode=0"
-            )
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate()
-        self._optimizer.step()
-        self.count += 1
-        self._average()
+        self._skipped_in_a_row = step_if_finite(
+            self._optimizer,
+            "a step of the world model",
+            loss.item(),
+            norm + success_norm,
+            self._skipped_in_a_row,
+            "lower world_model.lr; in a run, use imagination.learn.steps_per_episode=0",
+        )
+        self.serving.version = count + 1
+        # The average is over fewer steps at the beginning.
+        decay = min(AVERAGE, (count + 1) / (10 + count))
+        follow(self.serving, self.world, 1 - decay)
+        for served, now in zip(self.serving.buffers(), self.world.buffers(), strict=True):
+            served.copy_(now)
         return metrics | {"loss": loss.item(), "grad_norm": norm}
+
+    def metrics(self) -> dict[str, float]:
+        return {"learn_steps": float(self.serving.version), "learn_episodes": float(len(self.played))}
 
     def state(self) -> dict[str, Any]:
         """Copies all that `restore` needs; see `snapshot`."""
         return {
             "world": copied(self.world),
             "serving": copied(self.serving),
-            "count": self.count,
-            "rng": copy.deepcopy(self.rng),
-            "generator": self._generator.get_state(),
+            "version": self.serving.version,
+            "learnt": list(self.serving.learnt),
+            "played": list(self.played),
+            "pending_steps": self.pending_steps,
             "optimizer": optimizer_state(self._optimizer),
             "labelled": self._labelled,
         }
@@ -114,76 +180,147 @@ class Trainer:
         """Continues from a `state`."""
         self.world.load_state_dict(state["world"])
         self.serving.load_state_dict(state["serving"])
-        self.count = state["count"]
-        self.rng = state["rng"]
+        self.serving.version = state["version"]
+        self.serving.learnt = state["learnt"]
+        self.played.extend(state["played"])
+        self.pending_steps = state["pending_steps"]
         self._labelled = state["labelled"]
-        self._generator.set_state(state["generator"])
         restore_optimizer(self._optimizer, state["optimizer"])
 
-    def _draw(self, episodes: Sequence[Episode], weights: np.ndarray, count: int) -> Windows:
-        """Windows that begin at frames of equal chance in episodes drawn by `weights`."""
-        chosen = self.rng.choice(len(episodes), size=count, p=weights)
-        at = []
-        for e in chosen.tolist():
-            frame = self.rng.integers(episodes[e].starts)
-            at.append(WindowStart(e, int(frame)))
-        return cut_windows(episodes, at, self.world.model.spec, CHUNKS)
+    def _groups(self) -> list[list[WindowStart]]:
+        """Starts of windows in recorded and in played episodes."""
+        return [self._recorded, starts_of(self.played)]
 
-    def _replayed(self, episodes: Sequence[Episode], weights: np.ndarray) -> Labelled | None:
+    def _cut(self, at: Sequence[WindowStart], chunks: int | None = None) -> Windows:
+        return cut_windows(at, self.world.model.spec, chunks, self.world.device)
+
+    def _replayed(self) -> Labelled | None:
         """Frames of as many successes as failures, half of them replayed from their first frame on."""
-        succeeded = np.array([episode.success for episode in episodes])
         at = []
-        for of_outcome in (weights * succeeded, weights * ~succeeded):
-            if not of_outcome.any():
+        for outcome in (True, False):
+            groups = []
+            for group in self._groups():
+                groups.append([start for start in group if start.episode.success == outcome])
+            if not any(groups):
                 return None
-            chances = of_outcome / of_outcome.sum()
-            for e in self.rng.choice(len(episodes), size=REPLAYED // 2, p=chances).tolist():
-                frame = int(self.rng.integers(episodes[e].starts_before_success))
-                if self.rng.random() < 0.5:
-                    frame = 0
-                at.append(WindowStart(e, frame))
-        windows = whole_windows(episodes, at, self.world)
+            at += draw(groups, REPLAYED // 2)
+        at[::2] = [start._replace(frame=0) for start in at[::2]]
+        windows = self._cut(at)
         known = windows.known
-        recorded = windows.frames[known]
         imagined = replay(self.serving.model, windows)[known]
-        success = windows.success[known]
-        return Labelled(torch.cat([recorded, imagined]), windows.known_tasks.repeat(2, 1), success.repeat(2))
-
-    def _halves(self, labelled: Labelled) -> Labelled:
-        """A batch of as many successes as failures."""
-        rows = []
-        for of_outcome in (labelled.success, ~labelled.success):
-            candidates = of_outcome.nonzero()[:, 0].numpy()
-            rows.append(self.rng.choice(candidates, SUCCESS_BATCH // 2))
-        chosen = torch.from_numpy(np.concatenate(rows))
-        return Labelled(*(part[chosen] for part in labelled))
+        frames = torch.cat([windows.frames[known], imagined])
+        success = windows.success[known].repeat(2)
+        return Labelled(frames, windows.known_codes.repeat(2, 1), success)
 
     def _rate(self) -> float:
-        rising = min(1.0, (self.count + 1) / WARMUP)
+        count = self.serving.version
+        rate = self._lr * min(1.0, (count + 1) / WARMUP)
         if self._steps is None:
-            return self._lr * rising
-        done = min(1.0, self.count / self._steps)
-        falling = 0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done))
-        return self._lr * rising * falling
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        # The average is over fewer steps at the beginning.
-        decay = min(AVERAGE, self.count / (9 + self.count))
-        for mean, now in zip(self.serving.parameters(), self.world.parameters(), strict=True):
-            mean.lerp_(now, 1 - decay)
-        for served, now in zip(self.serving.model.buffers(), self.world.model.buffers(), strict=True):
-            served.copy_(now)
+            return rate
+        done = min(1.0, count / self._steps)
+        return rate * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done)))
 
 
-def uniform(episodes: Sequence[Episode]) -> np.ndarray:
-    """Weights by which all frames have the same chance."""
-    starts = np.array([episode.starts for episode in episodes], float)
-    return starts / starts.sum()
+def draw(groups: Sequence[list[WindowStart]], count: int) -> list[WindowStart]:
+    """So many starts, from each group that has any equally many, all of a group with the same chance."""
+    groups = [group for group in groups if group]
+    drawn = []
+    for group in groups:
+        for row in torch.randint(len(group), (count // len(groups),)).tolist():
+            drawn.append(group[row])
+    return drawn
 
 
-def whole_windows(episodes: Sequence[Episode], at: Sequence[WindowStart], world: World) -> Windows:
-    """Windows that go on to the end of the longest of the episodes."""
-    spec = world.model.spec
-    longest = max(len(episodes[start.episode]) for start in at)
-    return cut_windows(episodes, at, spec, math.ceil(longest / spec.chunk))
+def balanced(labelled: Labelled) -> Labelled:
+    """A batch of as many successes as failures."""
+    rows = []
+    for of_outcome in (labelled.success, ~labelled.success):
+        candidates = of_outcome.nonzero()[:, 0]
+        rows.append(candidates[torch.randint(len(candidates), (SUCCESS_BATCH // 2,))])
+    chosen = torch.cat(rows)
+    return Labelled(*(part[chosen] for part in labelled))
+
+
+def make_trainer(config: RunConfig) -> Trainer:
+    """The trainer of a run's world model, which goes on with the episodes that it was trained on."""
+    learn = config.imagination.learn
+    world = world_of(config.imagination)
+    recorded: list[Episode] = []
+    if learn.dataset.repo_id is not None:
+        with about_learning():
+            for episode in load_episodes(learn.dataset, world.model.spec):
+                if episode.key in world.learnt:
+                    recorded.append(episode)
+            if not recorded:
+                hint = "the world model of imagination.path was trained on no episode of it; name another"
+                raise InputError("dataset.repo_id", learn.dataset.repo_id, hint)
+    return Trainer(world, recorded, ONLINE_LR, steps_per_episode=learn.steps_per_episode)
+
+
+def save_online(directory: Path, trainer: Trainer) -> None:
+    """Writes the learned models into a checkpoint, as ``accerl world-model`` writes them."""
+    save_world(directory / WORLD_MODEL, trainer.serving)
+
+
+class OnlineLearningWorker:
+    """The world-model process of a run that imagines; becomes a threaded Ray actor in `launch`.
+
+    consumes    the trainer's batches, of which it takes whole real episodes
+    produces    versions of both models, which the driver hands to the rollout workers
+    waits for   a batch; no other process waits for it
+    ends        with the run
+    """
+
+    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        errors.collect_warnings()
+        self._clock = open_clock(timeline, WORLD_LEARNING)
+        torch.set_num_threads(config.trainer.num_threads)
+        torch.manual_seed(config.seed)
+        self._trainer = make_trainer(config)
+        if state is not None:
+            self._trainer.restore(snapshot.load(state / ONLINE))
+        self._lock = threading.Lock()  # held while the trainer changes, for one step at a time
+        self._inbox: queue.SimpleQueue[list[Segment]] = queue.SimpleQueue()
+        self._publish()
+        self._clock.enter(WAIT_IN)
+
+    def ready(self) -> int:
+        return os.getpid()
+
+    def learn(self, batch: list[Segment]) -> None:
+        """Leave a batch to `run`."""
+        self._inbox.put(batch)
+
+    def run(self) -> None:
+        """Makes the steps that are due, until the process ends."""
+        while True:
+            if self._trainer.pending_steps < 1 or not self._inbox.empty():
+                batch = self._inbox.get()
+                with self._lock, self._clock.during(COMPUTE):
+                    for segment in batch:
+                        self._trainer.add(segment)
+                continue
+            fault_point("learning.step")
+            with self._lock, self._clock.during(COMPUTE):
+                self._trainer.step()
+            if self._trainer.pending_steps < 1:
+                self._publish()
+
+    def metrics(self) -> dict[str, float]:
+        """Counts; ``version`` is that of `weights`."""
+        self._clock.beat()
+        return self._trainer.metrics() | {"version": float(self._newest[0])}
+
+    def weights(self) -> tuple[int, dict[str, Any]]:
+        """The newest version and its weights."""
+        return self._newest
+
+    def save(self, directory: Path) -> None:
+        """Write the trainer's part of a checkpoint."""
+        with self._lock, self._clock.during(CHECKPOINT):
+            snapshot.save(directory / TRAINING_STATE / ONLINE, self._trainer.state())
+            save_online(directory, self._trainer)
+
+    def _publish(self) -> None:
+        serving = self._trainer.serving
+        self._newest = (serving.version, copied(serving))

@@ -228,9 +228,7 @@ def outcomes(dataset: DatasetConfig) -> dict[str, list[bool]]:
     """Which episodes are successes, by each verb that reads labels."""
     shapes = {STATE: (4,), ACTION: (2,)}
     segments = recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1, time_limit=100)
-    spec = WorldModelSpec(
-        cameras=(FRONT,), image_size=(32, 32), state_dim=4, action_dim=2, chunk=2, context=1, fps=FPS
-    )
+    spec = WorldModelSpec(cameras=(FRONT,), image_size=(32, 32), state_dim=4, action_dim=2, chunk=2, fps=FPS)
     episodes = load_episodes(dataset, spec)
     chosen = picked(dataset, "successes") or []
     return {

@@ -113,14 +113,14 @@ def test_policies_and_datasets_load_wherever_they_are(hub: HubServer, run: Path,
 
 
 def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):
-    from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
+    from accerl_lerobot.world_model.imagined import World, load_world, save_world
 
-    world = World(model())
+    world = World(model(), ["go"], ["a"], ["auroc"])
     world.model.fit_statistics(windows(dots(2)))
-    save_world(tmp_path / "world_model", world, ["a"], ["auroc"])
+    save_world(tmp_path / "world_model", world)
     accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/environment")
     accerl("pull", "--repo_id=alice/environment", f"--output_dir={tmp_path / 'pulled'}")
-    came, content = load_world(tmp_path / "pulled"), read_content(tmp_path / "pulled")
-    assert content["learnt"] == ["a"] and content["failed_checks"] == ["auroc"]
+    came = load_world(tmp_path / "pulled")
+    assert (came.tasks, came.learnt, came.failed_checks) == (["go"], ["a"], ["auroc"])
     assert (came.model.spec, came.model.config) == (world.model.spec, world.model.config)
     assert all(torch.equal(value, came.state_dict()[name]) for name, value in world.state_dict().items())

@@ -25,12 +25,10 @@ from accerl_lerobot.world_model.contract import (
 @LearnableModelConfig.register_subclass("linear")
 @dataclass(frozen=True, kw_only=True)
 class LinearModelConfig(LearnableModelConfig):
-    """Settings of a model that needs only one frame."""
+    """Settings of the model."""
 
     make = "tests.world_model.linear_world:LinearWorldModel"
 
-    context: int = 1
-    """Frames it sees, the newest included."""
     gain: float = 1.0
     """Factor on its motions; > 0."""
 
@@ -56,22 +54,21 @@ class LinearWorldModel(LearnableWorldModel):
 
     def begin(self, context: Context, tasks: Sequence[str]) -> State:
         """See the base class."""
-        seen = {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
-        return {name: tensor.to(self.scale.device) for name, tensor in seen.items()}
+        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
     @torch.no_grad()
-    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
+    def step(self, state: State, actions: Tensor) -> Prediction:
         """See the base class."""
         robot = state["robot"] + self._moved(actions)
         return Prediction(state=state | {"robot": robot}, frames=state["frames"], robot=robot)
 
-    def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, float]]:
         """Mean squared error of the first motion."""
-        before, after = windows.context.robot[:, -1].to(self.scale), windows.robot[:, 0].to(self.scale)
-        error = before + self._moved(windows.actions[:, 0]) - after
+        moved = windows.robot[:, 0] - windows.context.robot[:, -1]
+        error = self._moved(windows.actions[:, 0]) - moved
         loss = (error / self.scale).square().mean()
         return loss, {"motion": loss.item()}
 
     def _moved(self, actions: Tensor) -> Tensor:
-        moved: Tensor = self.gain * self.scale * self.motion(actions.flatten(1).to(self.scale.device))
+        moved: Tensor = self.gain * self.scale * self.motion(actions.flatten(1))
         return moved

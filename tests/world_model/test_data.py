@@ -23,34 +23,33 @@ from accerl_lerobot.world_model.contract import (
     WorldModelSpec,
     cut_windows,
     load_episodes,
-    split_episodes,
+    starts_of,
 )
 from tests.tiny_datasets import record_dataset
 
 K = 3
 SPEC = WorldModelSpec(
-    cameras=("observation.images.front",), image_size=(16, 16), state_dim=4, action_dim=2, chunk=K, context=2,
-    fps=80,
+    cameras=("observation.images.front",), image_size=(16, 16), state_dim=4, action_dim=2, chunk=K, fps=80,
 )  # fmt: skip
 
 
-def an_episode(steps: int = 8, *, every: int = 1, success_at: int = -1, last: bool = False) -> Episode:
+def an_episode(steps: int = 8, *, every: int = 1, success: bool = False, last: bool = False) -> Episode:
     """Frame and state say which env step they show; action i is (i, −i)."""
     times = np.arange(0, steps, every)
     if last:
-        times = np.append(times[times < steps], steps)
+        times = np.append(times, steps)
     return Episode(
         frames=np.broadcast_to(times[:, None, None, None, None], (len(times), 1, 2, 2, 3)).astype(np.uint8),
         times=times.astype(np.int64),
         state=times[:, None].astype(np.float32),
         actions=np.stack([np.arange(steps), -np.arange(steps)], 1).astype(np.float32),
-        success_at=success_at,
+        success=success,
         task="go",
     )
 
 
-def cut(episode: Episode, frame: int, context: int, chunks: int) -> Windows:
-    return cut_windows([episode], [WindowStart(0, frame)], replace(SPEC, context=context), chunks)
+def cut(episode: Episode, frame: int, chunks: int | None) -> Windows:
+    return cut_windows([WindowStart(episode, frame)], SPEC, chunks)
 
 
 def shown(frames: Tensor) -> list[int]:
@@ -58,11 +57,11 @@ def shown(frames: Tensor) -> list[int]:
 
 
 def test_a_window_inside_an_episode():
-    windows = cut(an_episode(20), 7, 3, 2)
+    windows = cut(an_episode(20), 7, 2)
     context = windows.context
-    assert shown(context.frames) == [1, 4, 7] and shown(windows.frames) == [10, 13]
-    assert context.robot[0, :, 0].tolist() == [1, 4, 7] and windows.robot[0, :, 0].tolist() == [10, 13]
-    assert context.actions[0, :, :, 0].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert shown(context.frames) == [4, 7] and shown(windows.frames) == [10, 13]
+    assert context.robot[0, :, 0].tolist() == [4, 7] and windows.robot[0, :, 0].tolist() == [10, 13]
+    assert context.actions[0, :, 0].tolist() == [4, 5, 6]
     assert windows.actions[0, :, :, 0].tolist() == [[7, 8, 9], [10, 11, 12]]
     assert windows.steps.tolist() == [[3, 3]] and windows.known.all() and not windows.success.any()
     assert windows.tasks == ("go",) and shown(context.first_frame) == 0 == context.first_robot.item()
@@ -70,44 +69,29 @@ def test_a_window_inside_an_episode():
 
 
 def test_the_context_stops_at_the_first_frame():
-    context = cut(an_episode(20), 4, 3, 1).context
-    assert shown(context.frames) == [0, 1, 4]
-    assert context.actions[0, :, :, 1].tolist() == [[0, 0, 0], [-1, -2, -3]]
+    context = cut(an_episode(20), 1, 1).context
+    assert shown(context.frames) == [0, 1] and context.actions[0, :, 1].tolist() == [0, 0, 0]
+    context = cut(an_episode(20), 2, 1).context
+    assert context.actions[0, :, 1].tolist() == [0, 0, -1]
 
 
 def test_an_episode_that_ends_within_a_chunk_repeats_its_last_frame_and_action():
     """Demonstrations have no frame after the last step: frames 0 to 7, actions 0 to 7."""
-    windows = cut(an_episode(8, success_at=7), 3, 1, 3)
+    windows = cut(an_episode(8, success=True), 3, 3)
     assert shown(windows.frames) == [6, 7, 7] and windows.steps.tolist() == [[3, 1, 0]]
     assert windows.actions[0, :, :, 0].tolist() == [[3, 4, 5], [6, 7, 7], [7, 7, 7]]
-    assert windows.success.tolist() == [[False, True, False]] == windows.success.tolist()
+    assert windows.success.tolist() == [[False, True, False]]
     assert windows.known.tolist() == [[True, True, False]]
 
 
 def test_an_episode_with_a_frame_for_each_decision():
-    episode = an_episode(8, every=K, success_at=7, last=True)
-    assert episode.times.tolist() == [0, 3, 6, 8] and episode.starts == 3
-    first, third = cut(episode, 0, 2, 3), cut(episode, 2, 2, 3)
-    assert shown(first.context.frames) == [0, 0] and shown(first.frames) == [3, 6, 8]
-    assert first.steps.tolist() == [[3, 3, 2]] and first.success.tolist() == [[False, False, True]]
-    assert shown(third.context.frames) == [3, 6] and shown(third.frames) == [8, 8, 8]
-    assert third.known.tolist() == [[True, False, False]]
-
-
-def test_what_follows_a_success_is_not_known():
-    windows = cut(an_episode(15, success_at=4), 0, 1, 5)
-    assert windows.known.tolist() == [[True, True, False, False, False]]
-    assert an_episode(15, success_at=4).starts_before_success == 5 and an_episode(15).starts == 14
-
-
-def test_a_split_has_both_outcomes_on_both_sides():
-    episodes = [an_episode(success_at=3 if i % 4 == 0 else -1) for i in range(20)]
-    learnt, held = split_episodes(episodes, np.random.default_rng(0))
-    assert {*map(id, learnt + held)} == {*map(id, episodes)} and len(held) == 1 + 3
-    for part in (learnt, held):
-        assert {episode.success for episode in part} == {True, False}
-    few = [an_episode(), an_episode(), an_episode(success_at=1), an_episode(success_at=1)]
-    assert [len(part) for part in split_episodes(few, np.random.default_rng(0))] == [2, 2]
+    episode = an_episode(8, every=K, success=True, last=True)
+    assert episode.times.tolist() == [0, 3, 6, 8] and len(starts_of([episode, episode])) == 6
+    whole, third = cut(episode, 0, None), cut(episode, 2, 2)
+    assert shown(whole.context.frames) == [0, 0] and shown(whole.frames) == [3, 6, 8]
+    assert whole.steps.tolist() == [[3, 3, 2]] and whole.success.tolist() == [[False, False, True]]
+    assert shown(third.context.frames) == [3, 6] and shown(third.frames) == [8, 8]
+    assert third.known.tolist() == [[True, False]] == third.success.tolist()
 
 
 @pytest.fixture(scope="module")
@@ -126,20 +110,21 @@ def test_every_frame_and_action_is_the_dataset_s_once(
     rows = LeRobotDataset("a/b", root=dataset.root)
     merge_datasets([rows, rows], output_repo_id="a/b", output_dir=tmp_path / "twice")
     episodes = load_episodes(replace(dataset, root=str(tmp_path / "twice")), spec)
-    assert len(episodes) == rows.meta.total_episodes == 6 and sum(map(len, episodes)) == len(rows)
+    assert len(episodes) == rows.meta.total_episodes == 6
+    assert sum(len(episode.actions) for episode in episodes) == len(rows)
     index = 0
     for episode in episodes:
         assert episode.task in rows.meta.tasks.index
         successes = []
-        for t in range(len(episode)):
+        for t in range(len(episode.actions)):
             row = rows[index + t]
             image = (row[spec.cameras[0]] * 255).round().numpy()
             assert np.array_equal(episode.frames[t, 0].transpose(2, 0, 1), image)
             assert np.array_equal(episode.state[t], row["observation.state"].numpy())
             assert np.array_equal(episode.actions[t], row["action"].numpy())
             successes.append(bool(row["next.success"]))
-        assert episode.success_at == (successes.index(True) if any(successes) else -1)
-        index += len(episode)
+        assert not any(successes[:-1]) and successes[-1] == episode.success
+        index += len(successes)
     assert {episode.success for episode in episodes} == {True, False}
 
 
@@ -164,7 +149,7 @@ def test_what_cannot_be_learned_from(changes: dict[str, Any], why: str, monkeypa
     features = {name: {"shape": shape} for name, shape in shapes.items() if isinstance(shape, tuple)}
     meta = SimpleNamespace(features=features, fps=fps, camera_keys=[])
     monkeypatch.setattr(contract, "open_metadata", lambda dataset: meta)
-    with pytest.raises(InputError, match=f"^other.repo_id='a/b': {why}"):
-        contract.check_dataset(DatasetConfig(repo_id="a/b"), SPEC, "other")
+    with pytest.raises(InputError, match=f"^dataset.repo_id='a/b': {why}"):
+        contract.check_dataset(DatasetConfig(repo_id="a/b"), SPEC)
     if "fps" in changes:  # as datasets of LIBERO's demonstrations are labelled
-        contract.check_dataset(DatasetConfig(repo_id="a/b"), replace(SPEC, labelled_fps=(10,)), "other")
+        contract.check_dataset(DatasetConfig(repo_id="a/b"), replace(SPEC, labelled_fps=(10,)))

@@ -190,13 +190,3 @@ def test_a_policy_without_proprioception_or_without_images():
     assert made.encode(batch.observations, batch.tasks, np.zeros(6, np.float32)).shape == (6, 8 + 1)
     with pytest.raises(InputError, match=r"world_model\.type='latent': the policy reads no images"):
         model(SPEC._replace(cameras={}))
-
-
-def test_the_learning_rate_is_the_models_own():
-    still, moving = model(), model()
-    still.learning_rate = 0.0
-    for made in (still, moving):
-        learner = StateLearner(made)
-        learner.submit(transitions(64, seed=1), NUMBERS)
-        same = torch.equal(learner.model.cloned[0].weight, made.cloned[0].weight)
-        assert same == (made is still)
