@@ -124,6 +124,11 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+def input_error(error: BaseException) -> InputError | None:
+    """The `InputError` that another error wraps, if there is one."""
+    return next((link for link in causes(error) if isinstance(link, InputError)), None)
+
+
 def is_full(error: BaseException | None) -> bool:
     """True if an error is that of a full disk, here or in a worker whose error carries the text."""
     words = os.strerror(errno.ENOSPC)
@@ -277,17 +282,13 @@ def show_warnings(warnings: Iterable[Any]) -> None:
 
 def error_as_json(error: BaseException) -> dict[str, Any]:
     """An exception as plain values: the `InputError` in its chain, or its type and text in one line."""
-    refused = next((link for link in causes(error) if isinstance(link, InputError)), None)
+    refused = input_error(error)
     if refused is None:
         return {"error": in_one_line(error, LONGEST_HANDED)}
-    value = None
-    if refused.value is not None:
-        value = str(refused.value)[:LONGEST_HANDED]
-    why = refused.hint[:LONGEST_HANDED]
-    return {"field": refused.field, "value": value, "why": why}
+    return {"refused": [refused.field, refused.value, refused.hint]}
 
 
 def raise_refusal(answer: dict[str, Any]) -> None:
     """Raise the `InputError` that `error_as_json` has described, if it was one."""
-    if "field" in answer:
-        raise InputError(answer["field"], answer["value"], answer["why"])
+    if "refused" in answer:
+        raise InputError(*answer["refused"])

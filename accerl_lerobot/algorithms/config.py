@@ -123,9 +123,9 @@ class LossInputs:
     value: Tensor  # (N,), V of the current critic; carries gradient
     returns: Tensor  # (N,), what V is regressed to
     entropy: Tensor  # (N,), entropy of π at each decision; carries gradient if it is to be used
-    factors: Tensor | None = None
+    factors: Tensor
     """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
-    is never looked at. None: all exist."""
+    is never looked at."""
     ratios_per_decision: float | None = None
     """Mean number of ratios per decision of the batch that this one is a micro-batch of; with it the losses
     of micro-batches, weighted by their decisions, add up to that of the batch. None: this is all of it."""

@@ -48,8 +48,7 @@ def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
 
     Factors that do not exist add 0 and get no gradient, even where they are NaN.
     """
-    if inputs.factors is not None:
-        x = x.masked_fill(~inputs.factors, 0.0)
+    x = x.masked_fill(~inputs.factors, 0.0)
     if level == "token":
         return x
     return x.sum(dim=-1, keepdim=True)
@@ -90,8 +89,6 @@ def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
 
     Averaging over each decision's own first would bias the policy gradient towards decisions with few.
     """
-    if inputs.factors is None:
-        return x.mean()
     counts = present(inputs.factors, level)
     if inputs.ratios_per_decision is None:
         return masked_mean(x, counts)
@@ -116,7 +113,6 @@ def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tens
     mean_weight = masked_mean(weighted, keep)
     mean_square = masked_mean(weighted.square(), keep)
     lost = weight < LOW_WEIGHT
-    logs = log_ratio.masked_fill(~keep, math.nan).flatten()
     spread = returns.var(correction=0)
     left = (returns - value).var(correction=0)
     explained = 1.0 - left / spread.clamp(min=VARIANCE_FLOOR)
@@ -126,9 +122,6 @@ def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tens
         "low_weight": masked_mean(lost.float(), keep),
         "clip_fraction": masked_mean(clipped.float(), keep),
         "ratio_max_dev": (rho - 1.0).abs().max(),
-        "log_ratio_p05": logs.nanquantile(0.05),
-        "log_ratio_p50": logs.nanquantile(0.5),
-        "log_ratio_p95": logs.nanquantile(0.95),
         "explained_variance": explained.masked_fill(spread <= VARIANCE_FLOOR, 0.0),
     }
 
@@ -136,7 +129,7 @@ def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tens
 def lag_metrics(version: Tensor, trainer_version: int) -> Metrics:
     """How stale a batch is, in updates; `version`, int (N,), is of the weights behind each decision."""
     lag = (trainer_version - version).float()
-    return {"lag_mean": float(lag.mean()), "lag_p95": float(lag.quantile(0.95)), "lag_max": float(lag.max())}
+    return {"lag_mean": float(lag.mean()), "lag_max": float(lag.max())}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +139,8 @@ class LossOutput:
     loss: Tensor  # (), call ``backward`` on it
     means: dict[str, Tensor]  # means over decisions, scalars without gradient
     samples: Tensor
-    """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
-    of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
+    """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions: of each ratio
+    log ρ, ω and 1 if it exists, else 0; V; R."""
     clip: tuple[float, float]  # (low, high) of the clip range
 
     @property
@@ -188,9 +181,7 @@ def assemble(
         "entropy": mean_entropy,
     }
     means = {name: mean.detach() for name, mean in means.items()}
-    exists = torch.ones_like(log_ratio)
-    if inputs.factors is not None:
-        exists = present(inputs.factors, config.level)
+    exists = present(inputs.factors, config.level)
     columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
     samples = torch.cat([column.detach().double() for column in columns], 1)
     return LossOutput(loss=loss, means=means, samples=samples, clip=clip)

@@ -32,9 +32,9 @@ class JournalEntry:
     key: str
     origin: SegmentStart
     actions: np.ndarray  # float32 (env steps, A), as they were executed, one after the other
-    steps: tuple[int, ...]  # env steps of each decision; `rewards` have its cost taken off
-    versions: tuple[int, ...]
-    rewards: tuple[float, ...]
+    steps: list[int]  # env steps of each decision; `rewards` have its cost taken off
+    versions: list[int]
+    rewards: list[float]
     ended: bool  # True if the episode ended with it
     success: bool
 
@@ -88,19 +88,10 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
 
 
 def _entry(line: dict[str, Any]) -> JournalEntry:
-    encoded = base64.b64decode(line["actions"], validate=True)
-    actions = np.frombuffer(encoded, "<f4")
-    steps = tuple(line["steps"])
-    return JournalEntry(
-        key=line["key"],
-        origin=SegmentStart(line["task"], int(line["seed"]), int(line["decision"])),
-        actions=actions.reshape(sum(steps), line["action_dim"]),
-        steps=steps,
-        versions=tuple(line["versions"]),
-        rewards=tuple(line["rewards"]),
-        ended=line["ended"],
-        success=line["success"],
-    )
+    encoded = base64.b64decode(line.pop("actions"), validate=True)
+    actions = np.frombuffer(encoded, "<f4").reshape(sum(line["steps"]), line.pop("action_dim"))
+    origin = SegmentStart(line.pop("task"), line.pop("seed"), line.pop("decision"))
+    return JournalEntry(origin=origin, actions=actions, **line)
 
 
 def whole_episodes(segments: Iterator[JournalEntry]) -> Iterator[list[JournalEntry]]:

@@ -97,10 +97,8 @@ def policy_play(config: RunConfig, count: int, load: Load | None) -> Iterator[re
     if not environments:
         return
     plans = EpisodePlans(environments[0].spec.tasks, config.seed, count, PLAY_WORKER)
-    runner = RolloutRunner(
-        environments, lambda source: plans.next(True), config.rollout, PLAY,
-        on_segment=lambda segment: None, on_episode=plans.ended,
-    )  # fmt: skip
+    plans.exploring = True
+    runner = RolloutRunner(environments, plans, config.rollout)
     with closing(runner):
         requests = {slot: runner.start(slot) for slot in range(len(runner))}
         while True:
@@ -110,6 +108,8 @@ def policy_play(config: RunConfig, count: int, load: Load | None) -> Iterator[re
             decisions = adapter.decide(list(due.values()), 0)
             for slot, decision in zip(due, decisions, strict=True):
                 requests[slot] = runner.advance(slot, decision)
+            runner.segments.clear()
+            runner.results.clear()
             yield from ended
             ended.clear()
 

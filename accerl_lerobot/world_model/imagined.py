@@ -32,10 +32,10 @@ from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.record import make_expert
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
-from accerl_lerobot.errors import InputError, expanded, in_one_line
+from accerl_lerobot.errors import InputError, expanded, in_one_line, input_error
 from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
 from accerl_lerobot.policies.config import executed_rows
-from accerl_lerobot.policies.untrusted import Unfilled, input_error
+from accerl_lerobot.policies.untrusted import Unfilled
 from accerl_lerobot.rollout.runner import Starts, start_of
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (

@@ -77,7 +77,7 @@ def _refusing(work: Callable[[], Any]) -> Any:
 
 
 def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    said = json.dumps({"field": "sft.trust_remote_code", "value": "x.py", "why": "read it"})
+    said = json.dumps({"refused": ["sft.trust_remote_code", "x.py", "read it"]})
     program = f"print('Traceback')\nprint({ANSWER + said!r})\nraise SystemExit(1)"
     monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
     with pytest.raises(InputError) as caught:
@@ -130,7 +130,8 @@ def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path, monkeypat
             f"--dataset.root={root}",
         )
     answer = json.loads(capsys.readouterr().out.rpartition(ANSWER)[2])
-    assert answer["field"] == "dataset.root" and "is no template of a file" in answer["why"]
+    field, _, hint = answer["refused"]
+    assert field == "dataset.root" and "is no template of a file" in hint
 
 
 def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
