@@ -129,6 +129,16 @@ def stack_observations(requests: Sequence[Request]) -> tuple[Observations, list[
     return stacked(observations), [str(observation[TASK]) for observation in observations]
 
 
+def nonfinite(arrays: Mapping[str, Any]) -> str:
+    """The first name whose numbers are not finite; empty: there is none. Texts and integers are."""
+    for name, value in arrays.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            continue
+        if not np.isfinite(value).all():
+            return name
+    return ""
+
+
 def task_codes(tasks: Sequence[str]) -> np.ndarray:
     """float32 (B, 16): ±1 for each of 16 bits of an instruction's hash, known without a list of all tasks."""
     digests = [hashlib.sha256(task.encode()).digest()[:TASK_BITS] for task in tasks]

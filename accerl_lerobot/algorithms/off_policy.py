@@ -30,7 +30,7 @@ from accerl_lerobot.policies.stock import StockAdapter
 POLICY_BATCH = 64  # rows of one step of the policy
 CAP = 20.0  # largest weight of a decision in AWR, the paper's
 FORGET = 0.99  # share of the mean square of R − V that a step keeps
-FIRST = 1024  # rows that a column has space for at first; doubled when they are full
+FIRST = 1024  # rows that a column has space for at first; a full one doubles
 
 
 class Memory:
@@ -97,9 +97,8 @@ class Memory:
         """Sets rows of a column, after making space in it for all rows so far."""
         column = self._columns.get(name, values[:0])
         if len(column) < len(self):
-            size = max(FIRST, len(self), 2 * len(column))
-            missing = min(size, self.capacity) - len(column)
-            space = np.zeros((missing, *values.shape[1:]), values.dtype)
+            size = min(max(FIRST, 2 * len(self)), self.capacity)
+            space = np.zeros((size - len(column), *values.shape[1:]), values.dtype)
             column = np.concatenate([column, space])
             self._columns[name] = column
         column[rows] = values
@@ -154,7 +153,7 @@ class OffPolicyUpdate(BaseUpdate):
         metrics |= self.learn(len(rewards))
         # Lag is that of the new decisions only: those that the steps draw from the memory may be much older.
         versions = np.concatenate([segment.version for segment in segments])
-        metrics |= lag_metrics(torch.from_numpy(versions), self.version)
+        metrics |= lag_metrics(versions, self.version)
         self.version += 1
         metrics["skipped"] = float(self.skipped)
         return metrics

@@ -147,7 +147,7 @@ class RatioUpdate(BaseUpdate):
         fault_point("trainer.backward")
         metrics |= self._step(metrics["loss"])
         metrics |= mismatch
-        metrics |= lag_metrics(torch.from_numpy(batch.version), self.version)
+        metrics |= lag_metrics(batch.version, self.version)
         self.version += 1
         self._probe.renew(self.version)
         return metrics
@@ -237,7 +237,7 @@ class RatioUpdate(BaseUpdate):
             ranks.average_gradients(self._policy + self._value)
         metrics = self._whole_means(means)
         all_samples = ranks.gather(torch.cat(samples), len(batch))
-        for name, value in sample_metrics(all_samples, output.clip).items():
+        for name, value in sample_metrics(all_samples).items():
             metrics[name] = float(value)
         metrics["decisions"] = float(len(batch))
         metrics["return_mean"] = float(returns.mean())

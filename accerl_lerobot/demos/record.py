@@ -35,7 +35,6 @@ from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, Enviro
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.errors import (
-    ChildWarning,
     InputError,
     check_absent,
     collect_warnings,
@@ -211,7 +210,7 @@ def _ready(start: Callable[..., None], *arguments: Any) -> None:
 
 def _with_warnings[Item, Result](
     work: Callable[[Item], Result], item: Item
-) -> tuple[Result, list[ChildWarning]]:
+) -> tuple[Result, list[tuple[str, str]]]:
     return work(item), collected_warnings()
 
 

@@ -31,6 +31,7 @@ from accerl_lerobot.experience import (
     Request,
     Segment,
     SegmentStart,
+    nonfinite,
     stacked,
 )
 from accerl_lerobot.seeds import noise_seed, train_seed
@@ -471,13 +472,3 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
-
-
-def nonfinite(observation: Observation) -> str:
-    """The first name in an observation whose numbers are not finite; empty: there is none."""
-    for name, value in observation.items():
-        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
-            continue
-        if not np.isfinite(value).all():
-            return name
-    return ""

