@@ -111,9 +111,7 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
-    known: list[BaseException] = []
-    while error is not None and error not in known:
-        known.append(error)
+    while error is not None:
         yield error
         error = error.__cause__ or error.__context__
 

@@ -209,14 +209,13 @@ class TrainerConfig(Section, section="trainer"):
             return 0.6, 0.4 / math.ceil(others / gpus)
         return 1.0, 1 / math.ceil(others / (gpus - self.ranks))
 
-    def lr_share(self, update: int, *, start: int = 0, updates: int | None = None) -> float:
-        """Factor on a rate that begins with update `start` and falls over `updates`, or the config's."""
+    def lr_share(self, update: int, start: int = 0) -> float:
+        """Factor on a rate that begins with update `start`."""
         if update < start:
             return 0.0
         warm = start + self.warmup_updates
         if update < warm:
             return (update - start + 1) / self.warmup_updates
-        end = self.updates if updates is None else updates
-        done = min(1.0, (update - warm) / max(1, end - warm))
+        done = min(1.0, (update - warm) / max(1, self.updates - warm))
         fall = 0.5 * (1 + math.cos(math.pi * done))
         return self.final_lr_share + (1 - self.final_lr_share) * fall

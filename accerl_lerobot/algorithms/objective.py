@@ -135,18 +135,13 @@ def lag_metrics(version: np.ndarray, trainer_version: int) -> Metrics:
 
 @dataclass(frozen=True, kw_only=True)
 class LossOutput:
-    """Loss and metrics of one batch."""
+    """Loss of one batch, and what its metrics are computed from."""
 
     loss: Tensor  # (), call ``backward`` on it
     means: dict[str, Tensor]  # means over decisions, scalars without gradient
     samples: Tensor
     """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions: of each ratio
     log ρ, ω and 1 if it exists, else 0; V; R."""
-
-    @property
-    def metrics(self) -> dict[str, Tensor]:
-        """Scalars of this batch, still on the device."""
-        return self.means | sample_metrics(self.samples)
 
 
 def assemble(

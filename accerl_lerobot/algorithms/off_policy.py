@@ -133,8 +133,7 @@ class OffPolicyUpdate(BaseUpdate):
     def __init__(
         self, adapter: LeRobotAdapter | StockAdapter, algorithm: OffPolicyConfig, config: TrainerConfig
     ) -> None:
-        super().__init__(adapter, config)
-        self.policy_steps = algorithm.policy_steps
+        super().__init__(adapter, algorithm, config)
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
         self._pending_steps: dict[str, float] = {}
 
@@ -166,7 +165,7 @@ class OffPolicyUpdate(BaseUpdate):
         metrics = {"lr": lr}
         rows = self.imitable()
         if self.version >= start and len(rows):
-            steps = self.steps("policy", self.policy_steps, new)
+            steps = self.steps("policy", self.algorithm.policy_steps, new)
             metrics |= mean(self._policy_step(rows) for _ in steps)
         return metrics
 
@@ -244,7 +243,6 @@ class AWRUpdate(OffPolicyUpdate):
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: AWRConfig, config: TrainerConfig) -> None:
         super().__init__(adapter, algorithm, config)
-        self.algorithm = algorithm
         self._variance = 0.0  # mean square of R − V, over some hundred steps
         self.optimizer.add_param_group({"params": self._value, "lr": config.value_lr})
 

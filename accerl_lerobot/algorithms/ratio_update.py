@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,14 +59,14 @@ def make_update(adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig)
 class BaseUpdate(ABC):
     """The optimiser around one adapter, and what the updates of all algorithms share."""
 
-    def __init__(self, adapter: Any, config: TrainerConfig) -> None:
+    def __init__(self, adapter: Any, algorithm: Any, config: TrainerConfig) -> None:
         ranks.prepare(adapter, config)
         self.adapter = adapter
+        self.algorithm = algorithm
         self.config = config
         self.version = 0  # updates made
         self.skipped = 0
         self._skipped_in_a_row = 0
-        self._schedule_updates = config.updates
         self._policy: list[nn.Parameter] = []
         self._value: list[nn.Parameter] = []
         for name, parameter in adapter.trainable().items():
@@ -87,7 +88,7 @@ class BaseUpdate(ABC):
             "version": self.version,
             "skipped": self.skipped,
             "skipped_in_a_row": self._skipped_in_a_row,
-            "schedule_updates": self._schedule_updates,
+            "schedule_updates": self.config.updates,
             "optimizer": optimizer_state(self.optimizer),
         }
 
@@ -96,13 +97,13 @@ class BaseUpdate(ABC):
         self.version = state["version"]
         self.skipped = state["skipped"]
         self._skipped_in_a_row = state["skipped_in_a_row"]
-        self._schedule_updates = state["schedule_updates"]
+        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
+        self.config = replace(self.config, updates=state["schedule_updates"])
         restore_optimizer(self.optimizer, state["optimizer"])
 
     def lr_share(self, start: int = 0) -> float:
         """Share of the peak of a learning rate that begins with update `start`."""
-        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
-        return self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
+        return self.config.lr_share(self.version, start)
 
     def apply(self, optimizer: torch.optim.Optimizer, step: str, loss: float, norm: float) -> None:
         """Makes a step, unless its loss or its gradient's norm is not finite; those are counted.
@@ -122,8 +123,7 @@ class RatioUpdate(BaseUpdate):
     """Updates by a likelihood ratio."""
 
     def __init__(self, adapter: PolicyAdapter, algorithm: RatioConfig, config: TrainerConfig) -> None:
-        super().__init__(adapter, config)
-        self.algorithm = algorithm
+        super().__init__(adapter, algorithm, config)
         self.optimizer.add_param_group({"params": self._value})
         self._moments = torch.zeros(3, dtype=torch.float64)  # of the advantages so far
         self._probe = Probe(adapter, config)

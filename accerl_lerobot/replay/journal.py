@@ -98,12 +98,9 @@ def whole_episodes(segments: Iterator[JournalEntry]) -> Iterator[list[JournalEnt
     """Episodes of which all segments are there, in the order of their ends."""
     under_way: dict[tuple[str, int], list[JournalEntry]] = {}
     for segment in segments:
-        episode = segment.origin.task, segment.origin.seed
-        if segment.origin.decision == 0:
-            under_way[episode] = []
-        before = under_way.get(episode, [])
-        if sum(len(part.steps) for part in before) != segment.origin.decision:
-            continue  # a segment before this one is missing
-        before.append(segment)
+        task, seed, decision = segment.origin
+        under_way.setdefault((task, seed), []).append(segment)
         if segment.ended:
-            yield under_way.pop(episode)
+            episode = under_way.pop((task, seed))
+            if sum(len(part.steps) for part in episode[:-1]) == decision:  # else some are missing
+                yield episode

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import GIPOConfig, LossInputs, PPOConfig, RatioConfig
+from accerl_lerobot.algorithms import GIPOConfig, LossInputs, LossOutput, PPOConfig, RatioConfig
 from accerl_lerobot.algorithms.objective import (
     KL_LINEAR_ABOVE,
     LOG_RATIO_CLAMP,
@@ -74,6 +74,11 @@ def gradient(inputs: LossInputs, loss: torch.Tensor) -> torch.Tensor:
     return result
 
 
+def measured(output: LossOutput) -> dict[str, torch.Tensor]:
+    """All metrics of a batch."""
+    return output.means | sample_metrics(output.samples)
+
+
 Ragged = list[list[float]]
 """One list per decision, with an entry for each of its ratios."""
 
@@ -129,7 +134,7 @@ def ragged_factors(n: int, width: int) -> torch.Tensor:
 def test_equals_the_oracle(config: RatioConfig, factors: torch.Tensor) -> None:
     inputs = replace(make_inputs(factors=6), factors=factors)
     output = config.loss(inputs)
-    assert output.metrics["policy_loss"].item() == pytest.approx(policy_loss_of(inputs, config), abs=1e-12)
+    assert measured(output)["policy_loss"].item() == pytest.approx(policy_loss_of(inputs, config), abs=1e-12)
     assert output.loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
 
 
@@ -148,7 +153,7 @@ def test_ppo_by_hand(rho: float, advantage: float, expected: float, moves: bool)
     output = PPOConfig().loss(inputs)
     assert output.loss.item() == pytest.approx(expected, abs=1e-12)
     assert (gradient(inputs, output.loss).abs().item() > 0) is moves
-    assert output.metrics["low_weight"].item() == float(not moves)
+    assert measured(output)["low_weight"].item() == float(not moves)
 
 
 @pytest.mark.parametrize("level", ["token", "chunk"])
@@ -203,7 +208,7 @@ def test_absurd_ratios_stay_finite_in_float32(config: RatioConfig) -> None:
         factors=torch.ones(4, 1, dtype=torch.bool),
     )
     output = config.loss(inputs)
-    assert output.loss.isfinite() and all(m.isfinite() for m in output.metrics.values())
+    assert output.loss.isfinite() and all(m.isfinite() for m in measured(output).values())
     assert gradient(inputs, output.loss).isfinite().all()
 
 
@@ -218,8 +223,8 @@ def test_what_does_not_exist_is_never_looked_at(config: RatioConfig) -> None:
     dirty = replace(clean, **holes)
     expected, got = config.loss(clean), config.loss(dirty)
     torch.testing.assert_close(got.loss, expected.loss)
-    for name, metric in expected.metrics.items():
-        torch.testing.assert_close(got.metrics[name], metric, msg=name)
+    for name, metric in measured(expected).items():
+        torch.testing.assert_close(measured(got)[name], metric, msg=name)
     slope = gradient(dirty, got.loss)
     torch.testing.assert_close(slope, gradient(clean, expected.loss))
     assert (slope[~factors] == 0).all() and (slope[factors] != 0).any()
@@ -293,7 +298,7 @@ def test_lag() -> None:
 
 @each_algorithm
 def test_on_policy_batches_look_on_policy(config: RatioConfig) -> None:
-    metrics = {k: v.item() for k, v in config.loss(make_inputs(spread=0.0)).metrics.items()}
+    metrics = {k: v.item() for k, v in measured(config.loss(make_inputs(spread=0.0))).items()}
     for name in ("approx_kl", "kl", "clip_fraction", "low_weight", "ratio_max_dev"):
         assert metrics[name] == 0.0, name
     assert metrics["ess"] == pytest.approx(1.0)
