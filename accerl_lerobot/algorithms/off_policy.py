@@ -144,9 +144,9 @@ class OffPolicyUpdate(BaseUpdate):
         for segment in segments:
             self.remember(segment)
         rewards = np.concatenate([segment.reward for segment in segments])
-        metrics = {
-            "decisions": float(len(rewards)),
-            "memory_decisions": float(len(self.memory)),
+        metrics: Metrics = {
+            "decisions": len(rewards),
+            "memory_decisions": len(self.memory),
             "reward_mean": float(rewards.mean()),
         }
         metrics |= self.learn(len(rewards))
@@ -154,7 +154,7 @@ class OffPolicyUpdate(BaseUpdate):
         versions = np.concatenate([segment.version for segment in segments])
         metrics |= lag_metrics(versions, self.version)
         self.version += 1
-        metrics["skipped"] = float(self.skipped)
+        metrics["skipped"] = self.skipped
         return metrics
 
     def learn(self, new: int) -> Metrics:

@@ -239,7 +239,7 @@ class RatioUpdate(BaseUpdate):
         all_samples = ranks.gather(torch.cat(samples), len(batch))
         for name, value in sample_metrics(all_samples).items():
             metrics[name] = float(value)
-        metrics["decisions"] = float(len(batch))
+        metrics["decisions"] = len(batch)
         metrics["return_mean"] = float(returns.mean())
         metrics["reward_mean"] = float(batch.reward.mean())
         return metrics
@@ -269,7 +269,7 @@ class RatioUpdate(BaseUpdate):
             "value_grad_norm": value_norm,
             "lr": lr,
             "value_lr": value_lr,
-            "skipped": float(self.skipped),
+            "skipped": self.skipped,
         }
 
     def _clip(self, parameters: list[nn.Parameter]) -> float:

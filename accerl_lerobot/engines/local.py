@@ -110,7 +110,7 @@ class LocalEngine(Engine):
             done=self._training and not self._exploring,
             updates=updates,
             episodes=episodes,
-            rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
+            rollout=asdict(self._runner.counters),
             replay=self._replay.metrics(),
             world_model={} if learner is None else learner.metrics(),
             inference={"version": float(self._update.version)},

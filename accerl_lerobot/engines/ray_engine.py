@@ -381,7 +381,8 @@ class RayEngine(Engine):
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
-        state = (progress.version, progress.rollout)
+        moves = sum(slot.last_answer.moves for slot in self._rollouts if slot.last_answer is not None)
+        state = (progress.version, moves, progress.rollout["restarts"])
         planned = any(slot.outstanding for slot in self._rollouts)
         awaited = planned or (self._training and not self._done)
         now = time.monotonic()

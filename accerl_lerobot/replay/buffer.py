@@ -259,11 +259,12 @@ class Replay:
             self._remove(entry, "retired")
 
     def metrics(self) -> Metrics:
-        counts = asdict(self.counters)
-        counts["stored_segments"] = len(self._entries)
-        counts["stored_decisions"] = self.stored_decisions
-        counts["available_decisions"] = self.available_decisions
-        return {name: float(count) for name, count in counts.items()}
+        stored = {
+            "stored_segments": len(self._entries),
+            "stored_decisions": self.stored_decisions,
+            "available_decisions": self.available_decisions,
+        }
+        return asdict(self.counters) | stored
 
     def state(self, version: int | None = None) -> State:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.

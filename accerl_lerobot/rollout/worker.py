@@ -18,7 +18,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,7 @@ class Report:
     busy_s: float = 0.0
     """Seconds for which its thread has been at what it does now; 0 before `RolloutWorker.run`."""
     in_environment: bool = False  # True if that is to step or reset an environment
+    moves: int = 0  # resets and executed chunks of its environments
     spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
     starts: int = 0  # see `EpisodePlans.starts`
 
@@ -84,6 +85,7 @@ class RolloutWorker:
         self._spent = False
         self._max_pending = MAX_PENDING
         self._active: tuple[float, bool] | None = None  # since when the thread does what, see `Report`
+        self._moves = 0
         self._idle: list[int] = []  # slots without an episode
         self._due: dict[int, Request] = {}  # slot → request to be sent
         self._asked: dict[int, list[int]] = {}  # ticket of a message to inference → its slots
@@ -133,9 +135,10 @@ class RolloutWorker:
         ended = self._runner.results
         return Report(
             episodes=[ended.popleft() for _ in range(len(ended))],
-            counters={k: float(v) for k, v in vars(self._runner.counters).items()},
+            counters=asdict(self._runner.counters),
             busy_s=now - since,
             in_environment=in_environment,
+            moves=self._moves,
             spent=self._spent,
             starts=self._plans.starts,
         )
@@ -225,6 +228,7 @@ class RolloutWorker:
             fault_point("rollout.step")
             request = self._runner.advance(slot, decision)
         self._active = time.monotonic(), False
+        self._moves += decision is not None or request is not None
         if request is not None:
             self._due[slot] = request
         return request is not None
