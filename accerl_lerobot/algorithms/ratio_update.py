@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -135,15 +135,16 @@ class RatioUpdate(BaseUpdate):
         rows = np.arange(len(batch))
         parts = ranks.split_rows(rows, self.config.micro_batch, ranks.rank(), ranks.size())
         following = self._values(batch.last_observations, batch.segment_tasks)
-        evaluation: Evaluation | None = None
+        evaluations: Iterable[Evaluation] = (self.adapter.evaluate(*batch.part(part.rows)) for part in parts)
         if len(parts) == 1:  # the forward pass of a single micro-batch has the values
-            evaluation = self.adapter.evaluate(*batch.part(parts[0].rows))
+            (evaluation,) = evaluations
+            evaluations = [evaluation]
             local_values = evaluation.value.detach().cpu().float()
             values = ranks.gather(parts[0].counted(local_values), len(batch))
         else:
             values = self._values(batch.observations, batch.tasks)
         advantages, returns = self._targets(batch, values, following)
-        metrics = self._backward(batch, parts, evaluation, advantages, returns)
+        metrics = self._backward(batch, parts, evaluations, advantages, returns)
         fault_point("trainer.backward")
         metrics |= self._step(metrics["loss"])
         metrics |= mismatch
@@ -192,13 +193,13 @@ class RatioUpdate(BaseUpdate):
         self,
         batch: Batch,
         parts: Sequence[Part],
-        only: Evaluation | None,
+        evaluations: Iterable[Evaluation],
         advantages: Tensor,
         returns: Tensor,
     ) -> Metrics:
         """Accumulates the gradient of the loss over micro-batches; returns metrics of the whole batch.
 
-        `only` is the evaluation of a single micro-batch.
+        `evaluations` are of the parts, each made when its turn comes.
         """
         factors = self.adapter.factors(batch.latent)
         if factors is None:
@@ -206,11 +207,8 @@ class RatioUpdate(BaseUpdate):
         ratios = float(present(factors, self.algorithm.level).sum()) / len(batch)
         means: Metrics = {}
         samples: list[Tensor] = []
-        for part in parts:
+        for part, evaluation in zip(parts, evaluations, strict=True):
             rows = part.rows
-            evaluation = only
-            if evaluation is None:
-                evaluation = self.adapter.evaluate(*batch.part(rows))
             device = evaluation.log_prob.device
             inputs = LossInputs(
                 log_prob_new=evaluation.log_prob,
