@@ -181,16 +181,16 @@ def nonfinite(seed: int = 0) -> list[Segment]:
 @pytest.mark.parametrize("of", ["loss", "gradient"])
 def test_a_step_that_is_not_finite_is_skipped_and_counted(of: str):
     update = make_update()
-    before = update.adapter.copy()
+    before = update.adapter.copy_weights()
     hook = update.adapter.weight.register_hook(lambda g: g * math.inf if of == "gradient" else g)
     metrics = update.step(nonfinite() if of == "loss" else make_segments(LENGTHS))
     assert metrics["skipped"] == update.version == 1
     assert math.isfinite(metrics["loss"]) is (of == "gradient")
-    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy().items())
+    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy_weights().items())
     hook.remove()
     metrics = update.step(make_segments(LENGTHS))
     assert metrics["skipped"] == metrics["lag_mean"] == metrics["lag_max"] == 1
-    after = update.adapter.copy()
+    after = update.adapter.copy_weights()
     assert all(torch.isfinite(p).all() for p in after.values())
     assert not torch.equal(after["policy.weight"], before["policy.weight"])
 
@@ -310,7 +310,9 @@ def test_measuring_changes_nothing_that_is_learnt():
         metrics = with_.step(fresh(with_, i))
         expected = without.step(fresh(without, i))
         assert {k: v for k, v in metrics.items() if k not in NAMES} == expected
-    assert all(torch.equal(p, without.adapter.copy()[k]) for k, p in with_.adapter.copy().items())
+    assert all(
+        torch.equal(p, without.adapter.copy_weights()[k]) for k, p in with_.adapter.copy_weights().items()
+    )
 
 
 def test_the_live_weights_are_back_in_their_own_memory_whatever_happens(monkeypatch: pytest.MonkeyPatch):
@@ -318,7 +320,7 @@ def test_the_live_weights_are_back_in_their_own_memory_whatever_happens(monkeypa
     probe = Probe(adapter, PROBED)
     with torch.no_grad():
         adapter.weight.add_(0.3)
-    before, place = adapter.copy(), adapter.weight.data_ptr()
+    before, place = adapter.copy_weights(), adapter.weight.data_ptr()
 
     def evaluate(*_: Any) -> None:
         assert not torch.equal(adapter.weight, before["policy.weight"])
