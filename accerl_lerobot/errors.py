@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 logger = logging.getLogger(__name__)
 
@@ -93,20 +93,14 @@ def printable(text: str, keep: str = "") -> str:
         return text
     characters = []
     for character in text:
-        escapes = _controls(character) and character not in keep
-        characters.append(repr(character)[1:-1] if escapes else character)
+        space = unicodedata.category(character) == "Zs"  # of which only the usual one is printable
+        shown = space or character.isprintable() or character in keep
+        characters.append(character if shown else repr(character)[1:-1])
     return "".join(characters)
-
-
-def _controls(character: str) -> bool:
-    """True for a control character, and for a line separator."""
-    category = unicodedata.category(character)
-    return category.startswith("C") or category in ("Zl", "Zp")
 
 
 def check_absent(path: Path, field: str = "output_dir") -> None:
     """Refuses a folder for results that exists, or that cannot be created."""
-    expanded(str(path), field)
     if os.path.lexists(path):
         raise InputError(field, str(path), "the folder exists; choose another or remove it")
     above = next(folder for folder in path.absolute().parents if folder.exists())
@@ -116,11 +110,14 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
-    known: list[BaseException] = []
-    while error is not None and error not in known:
-        known.append(error)
+    while error is not None:
         yield error
         error = error.__cause__ or error.__context__
+
+
+def input_error(error: BaseException) -> InputError | None:
+    """The `InputError` that another error wraps, if there is one."""
+    return next((link for link in causes(error) if isinstance(link, InputError)), None)
 
 
 def expanded(path: str, field: str) -> Path:
@@ -210,13 +207,6 @@ PACKAGE = "accerl_lerobot"
 LONGEST_HANDED = 1000  # characters of a message of another process
 
 
-class ChildWarning(NamedTuple):
-    """A warning of another process: the name of its logger, and its text."""
-
-    logger: str
-    text: str
-
-
 class Once(logging.Filter):
     """Passes each distinct warning of this package once, whatever process or place it comes from."""
 
@@ -239,10 +229,10 @@ class _Collector(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.addFilter(Once())
-        self.new: deque[ChildWarning] = deque()
+        self.new: deque[tuple[str, str]] = deque()  # texts, and names of their loggers
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.new.append(ChildWarning(record.name, record.getMessage()[:LONGEST_HANDED]))
+        self.new.append((record.getMessage()[:LONGEST_HANDED], record.name))
 
 
 _collector = _Collector()
@@ -254,30 +244,26 @@ def collect_warnings() -> None:
     logging.getLogger(PACKAGE).addHandler(_collector)
 
 
-def collected_warnings(worker: object = None) -> list[ChildWarning]:
+def collected_warnings(worker: object = None) -> list[tuple[str, str]]:
     """Warnings of this process since the last call; `worker` is not used, Ray hands it over."""
     return [_collector.new.popleft() for _ in range(len(_collector.new))]
 
 
 def show_warnings(warnings: Iterable[Any]) -> None:
     """Log warnings of other processes, each once."""
-    for warning in map(ChildWarning._make, warnings):
-        warn_once(warning.text, warning.logger)
+    for text, name in warnings:
+        warn_once(text, name)
 
 
 def error_as_json(error: BaseException) -> dict[str, Any]:
     """An exception as plain values: the `InputError` in its chain, or its type and text in one line."""
-    refused = next((link for link in causes(error) if isinstance(link, InputError)), None)
+    refused = input_error(error)
     if refused is None:
         return {"error": in_one_line(error, LONGEST_HANDED)}
-    value = None
-    if refused.value is not None:
-        value = str(refused.value)[:LONGEST_HANDED]
-    why = refused.hint[:LONGEST_HANDED]
-    return {"field": refused.field, "value": value, "why": why}
+    return {"refused": [refused.field, refused.value, refused.hint]}
 
 
 def raise_refusal(answer: dict[str, Any]) -> None:
     """Raise the `InputError` that `error_as_json` has described, if it was one."""
-    if "field" in answer:
-        raise InputError(answer["field"], answer["value"], answer["why"])
+    if "refused" in answer:
+        raise InputError(*answer["refused"])

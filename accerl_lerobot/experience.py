@@ -8,9 +8,9 @@ NumPy only: a rollout worker that imports this file stays free of torch and LeRo
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -114,11 +114,29 @@ class Segment:
         return ((ends - self.steps) / self.time_limit).astype(np.float32)
 
 
+def stacked(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Observations or latents as a batch: one array (B, ...) for each name but `TASK`."""
+    arrays = {}
+    for name in rows[0]:
+        if name != TASK:
+            arrays[name] = np.stack([row[name] for row in rows])
+    return arrays
+
+
 def stack_observations(requests: Sequence[Request]) -> tuple[Observations, list[str]]:
     """Batches raw observations: each array (B, ...), and the B task texts."""
-    keys = [k for k in requests[0].observation if k != TASK]
-    arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
-    return arrays, [str(r.observation[TASK]) for r in requests]
+    observations = [request.observation for request in requests]
+    return stacked(observations), [str(observation[TASK]) for observation in observations]
+
+
+def nonfinite(arrays: Mapping[str, Any]) -> str:
+    """The first name whose numbers are not finite; empty: there is none. Texts and integers are."""
+    for name, value in arrays.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            continue
+        if not np.isfinite(value).all():
+            return name
+    return ""
 
 
 def task_codes(tasks: Sequence[str]) -> np.ndarray:

@@ -23,7 +23,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import psutil
 
@@ -62,26 +61,22 @@ def start() -> None:
 
 def remove(folder: Path) -> None:
     """Have a folder removed when this process has ended, if it is still there."""
-    _tell(folder=str(folder.absolute()))
+    _tell(str(folder.absolute()))
 
 
-def explain(hint: str) -> None:
-    """Set the hint that is printed if this process is killed; with an empty one nothing is printed."""
-    _tell(hint=hint)
-
-
-def _tell(**message: Any) -> None:
+def _tell(folder: str | None) -> None:
+    """Hand over a folder to remove; None: this process ends."""
     start()
     assert _process is not None and _process.stdin is not None
     with contextlib.suppress(OSError, ValueError):  # somebody has killed it; nothing here depends on it
-        _process.stdin.write(json.dumps(message).encode() + b"\n")
+        _process.stdin.write(json.dumps(folder).encode() + b"\n")
         _process.stdin.flush()
 
 
 def _dismiss(owner: int) -> None:
     if os.getpid() != owner or _process is None:
         return
-    _tell(bye=True)
+    _tell(None)
     with contextlib.suppress(subprocess.TimeoutExpired):
         _process.wait(END_S + LOOK_S)
 
@@ -105,35 +100,28 @@ def _ends_by_itself(process: psutil.Process) -> bool:
         return True
 
 
-def _listen(parent: int) -> tuple[list[Path], str]:
-    """Messages until the parent has ended: the folders to remove, and the line to print."""
+def _listen(parent: int) -> list[Path]:
+    """Waits until the parent has ended; the folders to remove."""
     folders: list[Path] = []
-    hint = ""
     text = b""
     while True:
         if not select.select([0], [], [], LOOK_S)[0]:
             if os.getppid() != parent:
-                return folders, hint
+                return folders
             continue
         more = os.read(0, 65536)
         if not more:
-            return folders, hint
+            return folders
         *lines, text = (text + more).split(b"\n")
-        for message in map(json.loads, lines):
-            if "folder" in message:
-                folders.append(Path(message["folder"]))
-            if "bye" in message:
-                return folders, ""
-            hint = message.get("hint", hint)
+        for folder in map(json.loads, lines):
+            if folder is None:
+                return folders
+            folders.append(Path(folder))
 
 
 def main(identity: str) -> None:
     """Wait for the end of the parent, then end and remove what it has left."""
-    folders, hint = _listen(os.getppid())
-    if hint:
-        with contextlib.suppress(OSError):  # its terminal may have been closed, which ended the parent
-            sys.stderr.write(f"accerl: the process was killed; {hint}\n")
-            sys.stderr.flush()
+    folders = _listen(os.getppid())
     deadline = time.monotonic() + END_S
     while time.monotonic() < deadline:
         left = left_behind(identity)

@@ -7,7 +7,6 @@ MetaWorld and Gymnasium take seeds below 2**32; each use owns one range of them.
 from __future__ import annotations
 
 import random
-import sys
 from typing import Any
 
 import numpy as np
@@ -68,24 +67,22 @@ def eval_seed(run_seed: int, index: int) -> int:
 
 
 def global_generators() -> dict[str, Any]:
-    """The states of the generators that libraries share: Python's, NumPy's, and torch's if it is in use."""
-    states: dict[str, Any] = {"python": random.getstate(), "numpy": np.random.get_state()}
-    if "torch" in sys.modules:
-        import torch
+    """The states of the generators that libraries share: Python's, NumPy's and torch's."""
+    import torch
 
-        states["torch"] = torch.get_rng_state()
-        states["cuda"] = []
-        if torch.cuda.is_available():
-            states["cuda"] = torch.cuda.get_rng_state_all()
-    return states
+    return {
+        "python": random.getstate(),
+        "numpy": np.random.get_state(),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all(),
+    }
 
 
 def restore_global_generators(states: dict[str, Any]) -> None:
+    import torch
+
     random.setstate(states["python"])
     np.random.set_state(states["numpy"])
-    if "torch" in states:
-        import torch
-
-        torch.set_rng_state(states["torch"])
-        if torch.cuda.is_available() and len(states["cuda"]) == torch.cuda.device_count():
-            torch.cuda.set_rng_state_all(states["cuda"])
+    torch.set_rng_state(states["torch"])
+    if len(states["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(states["cuda"])

@@ -317,7 +317,7 @@ def test_a_process_that_takes_anothers_place_imagines_from_its_episodes(world_mo
     worker = RolloutWorker(ENV, RolloutConfig(environments=1), imagination=imagination)
     worker.ready(EpisodePlans(("match",), 0, budget=0), [("match", 5)])
     worker.report(True, [])
-    plan = worker._next(IMAGINED)
-    assert worker._next(REAL) is None and plan is not None and plan.task == "match"
+    plan = worker._plans.next(IMAGINED, worker._starts)
+    assert worker._plans.next(REAL, worker._starts) is None and plan is not None and plan.task == "match"
     first, real = worker._environments[1].reset(plan.seed, "match"), make_environment(ENV).reset(5, "match")
     assert np.array_equal(first["observation.images.front"], real["observation.images.front"])

@@ -15,10 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from gymnasium import spaces
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.envs import GymConfig, make_environment
@@ -26,10 +24,10 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import check_features, env_features, policy_features
 from accerl_lerobot.policies.loading import load_lerobot_config
-from accerl_lerobot.seeds import demo_seed, eval_seed, train_seed
+from accerl_lerobot.seeds import eval_seed
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at, requests
-from tests.tiny_datasets import ACTION, FEATURES, FPS, FRONT, IMAGE, STATE, labels, rewrite, write_dataset
+from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, labels, rewrite, write_dataset
 
 
 class Arm(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -93,13 +91,6 @@ def test_an_environment_of_the_older_interface_is_told_what_to_return(
         environment.step_chunk(np.zeros((4, 2), np.float32))
 
 
-@pytest.mark.parametrize("run_seed", [0, 2**32 - 1, 2**63 - 1])
-def test_every_seed_of_an_episode_is_one_that_numpy_s_old_generator_takes(registered: Any, run_seed: int):
-    environment = make_environment(registered(Arm))
-    for seed in (demo_seed(run_seed, 7), train_seed(run_seed, 999, 10**6), eval_seed(run_seed, 9_999)):
-        environment.reset(seed, "reported/Arm-v0")
-
-
 def test_a_recipe_from_windows_names_a_policy(tiny_checkpoint: Path, tmp_path: Path):
     recipe = tmp_path / "recipe.yaml"
     text = f"\ufeffenv:\r\n  type: simulated\r\npolicy:\r\n  path: {tiny_checkpoint}\r\n"
@@ -158,27 +149,12 @@ def test_episodes_whose_borders_contradict_the_rows_are_refused(tmp_path: Path):
         pass
 
 
-def write_videos(root: Path) -> DatasetConfig:
-    """Two episodes of six frames of one grey each, with a file of videos for each episode."""
-    data = LeRobotDataset.create(
-        "a/b",
-        fps=FPS,
-        root=root,
-        features=FEATURES | {FRONT: IMAGE | {"dtype": "video"}},
-        video_files_size_in_mb=0.0001,  # type: ignore[arg-type]
-    )
-    for episode in range(2):
-        for step in range(6):
-            grey = np.full((32, 32, 3), 100 * episode + 15 * step + 10, np.uint8)
-            numbers = {STATE: np.zeros(4, np.float32), ACTION: np.zeros(2, np.float32)}
-            data.add_frame({FRONT: grey, "task": "Match the target", **numbers})
-        data.save_episode()
-    data.finalize()
-    return DatasetConfig(repo_id="a/b", root=str(root))
-
-
 def test_videos_in_several_files_and_timestamps_off_the_rate(tmp_path: Path):
-    dataset = write_videos(tmp_path / "data")
+    def grey(name: str, episode: int, step: int) -> Any:
+        return np.full((32, 32, 3), 100 * episode + 15 * step + 10) if name == FRONT else None
+
+    videos = {FRONT: IMAGE | {"dtype": "video"}}
+    dataset = write_dataset(tmp_path / "data", more=videos, values=grey, video_files_size_in_mb=0.0001)
     assert len(list((tmp_path / "data/videos").rglob("*.mp4"))) == 2
     with opened(dataset, open_metadata(dataset)) as data:
         greys = [255 * float(data[row][FRONT].mean()) for row in range(12)]

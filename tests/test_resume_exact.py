@@ -140,7 +140,6 @@ def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
     found = [u for u in updates(history) if "logprob/mismatch_max" in u]
     assert len(found) >= 3 and found[0]["update"] == 1
     assert max(u["logprob/mismatch_max"] for u in found) <= 1e-4
-    assert all(u["logprob/mismatch_clip"] == 0.0 for u in found)
     assert max(u["ratio_max_dev"] for u in found[1:]) > 1e-3, "the weights should have moved"
 
 

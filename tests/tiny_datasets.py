@@ -38,15 +38,16 @@ def write_dataset(
     values: Callable[[str, int, int], Any] = lambda name, episode, step: None,
     without: Sequence[str] = (),
     fps: int = FPS,
+    **options: Any,
 ) -> DatasetConfig:
     """One episode of `STEPS` frames for each of `tasks`, which may be one text or a text for each step.
 
-    `more` are further features, `values` gives those that are not random.
+    `more` are further features, `values` gives those that are not random; `options` are LeRobot's.
     """
     features = {name: f for name, f in FEATURES.items() if name not in without} | (more or {})
     videos = any(feature["dtype"] == "video" for feature in features.values())
     dataset = LeRobotDataset.create(
-        "a/b", fps=fps, features=features, root=root, use_videos=videos, video_backend="pyav"
+        "a/b", fps=fps, features=features, root=root, use_videos=videos, video_backend="pyav", **options
     )
     rng = np.random.default_rng(0)
     for episode, task in enumerate(tasks):

@@ -27,7 +27,7 @@ class Batch:
     log_prob: Tensor  # (N, L) of the behaviour policy
     reward: Tensor  # (N,)
     version: np.ndarray  # int64 (N,)
-    lengths: Tensor  # int64 (S,)
+    lengths: list[int]  # S
     terminated: Tensor  # bool (S,)
     last_observations: Observations  # each (S, ...)
     segment_tasks: list[str]  # S
@@ -64,7 +64,7 @@ def collate(segments: Sequence[Segment]) -> Batch:
         log_prob=torch.from_numpy(log_prob),
         reward=torch.from_numpy(reward),
         version=np.concatenate([s.version for s in segments]),
-        lengths=torch.tensor([len(s) for s in segments]),
+        lengths=[len(s) for s in segments],
         terminated=torch.tensor([s.terminated for s in segments]),
         last_observations=last_observations,
         segment_tasks=[s.task for s in segments],

@@ -123,9 +123,9 @@ class LossInputs:
     value: Tensor  # (N,), V of the current critic; carries gradient
     returns: Tensor  # (N,), what V is regressed to
     entropy: Tensor  # (N,), entropy of π at each decision; carries gradient if it is to be used
-    factors: Tensor | None = None
+    factors: Tensor
     """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
-    is never looked at. None: all exist."""
+    is never looked at."""
     ratios_per_decision: float | None = None
     """Mean number of ratios per decision of the batch that this one is a micro-batch of; with it the losses
     of micro-batches, weighted by their decisions, add up to that of the batch. None: this is all of it."""
@@ -209,14 +209,13 @@ class TrainerConfig(Section, section="trainer"):
             return 0.6, 0.4 / math.ceil(others / gpus)
         return 1.0, 1 / math.ceil(others / (gpus - self.ranks))
 
-    def lr_share(self, update: int, *, start: int = 0, updates: int | None = None) -> float:
-        """Factor on a rate that begins with update `start` and falls over `updates`, or the config's."""
+    def lr_share(self, update: int, start: int = 0) -> float:
+        """Factor on a rate that begins with update `start`."""
         if update < start:
             return 0.0
         warm = start + self.warmup_updates
         if update < warm:
             return (update - start + 1) / self.warmup_updates
-        end = self.updates if updates is None else updates
-        done = min(1.0, (update - warm) / max(1, end - warm))
+        done = min(1.0, (update - warm) / max(1, self.updates - warm))
         fall = 0.5 * (1 + math.cos(math.pi * done))
         return self.final_lr_share + (1 - self.final_lr_share) * fall

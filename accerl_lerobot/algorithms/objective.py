@@ -24,6 +24,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
+
 from accerl_lerobot.algorithms.config import AlgorithmConfig, Level, LossInputs
 from accerl_lerobot.config.ranges import NonNegative, Range, Share
 from accerl_lerobot.experience import Metrics
@@ -36,8 +38,7 @@ LOG_RATIO_CLAMP = 20.0
 KL_LINEAR_ABOVE = 3.0
 """Above this log ρ (ρ ≈ 20) the KL penalty is continued linearly: its gradient, (ρ − 1)·∇log π, is unbounded,
 so that one stale sample could decide a whole update."""
-USUAL_CLIP = (0.2, 0.2)
-"""Range (low, high) of the reported clip fraction of algorithms that clip nothing, so that runs compare."""
+USUAL_CLIP = 0.2  # |ρ − 1| above which the clip fraction counts, whatever an algorithm clips: runs compare
 LOW_WEIGHT = 0.1  # share of its gradient below which a sample is as good as lost
 TINY = 1e-30  # makes the effective sample size 0, and not NaN, when every weight is 0
 VARIANCE_FLOOR = 1e-12  # returns that vary less (a standard deviation of 1e-6) are constant up to rounding
@@ -48,8 +49,7 @@ def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
 
     Factors that do not exist add 0 and get no gradient, even where they are NaN.
     """
-    if inputs.factors is not None:
-        x = x.masked_fill(~inputs.factors, 0.0)
+    x = x.masked_fill(~inputs.factors, 0.0)
     if level == "token":
         return x
     return x.sum(dim=-1, keepdim=True)
@@ -90,8 +90,6 @@ def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
 
     Averaging over each decision's own first would bias the policy gradient towards decisions with few.
     """
-    if inputs.factors is None:
-        return x.mean()
     counts = present(inputs.factors, level)
     if inputs.ratios_per_decision is None:
         return masked_mean(x, counts)
@@ -104,19 +102,18 @@ def advantage_column(inputs: LossInputs) -> Tensor:
     return inputs.advantage.detach()[:, None]
 
 
-def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tensor]:
+def sample_metrics(samples: Tensor) -> dict[str, Tensor]:
     """Scalars, see ``docs/metrics.md``, of the `LossOutput.samples` of a batch's parts, in any order."""
     f = (samples.shape[1] - 2) // 3
     log_ratio, weight, exists, value, returns = samples.split([f, f, f, 1, 1], dim=1)
     keep = exists.bool()
     rho = ratio(log_ratio)
-    low, high = clip
-    clipped = (rho < 1.0 - low) | (rho > 1.0 + high)
+    deviation = (rho - 1.0).abs()
+    clipped = deviation > USUAL_CLIP
     weighted = weight * rho
     mean_weight = masked_mean(weighted, keep)
     mean_square = masked_mean(weighted.square(), keep)
     lost = weight < LOW_WEIGHT
-    logs = log_ratio.masked_fill(~keep, math.nan).flatten()
     spread = returns.var(correction=0)
     left = (returns - value).var(correction=0)
     explained = 1.0 - left / spread.clamp(min=VARIANCE_FLOOR)
@@ -125,47 +122,32 @@ def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tens
         "ess": mean_weight.square() / mean_square.clamp(min=TINY),  # Kish's
         "low_weight": masked_mean(lost.float(), keep),
         "clip_fraction": masked_mean(clipped.float(), keep),
-        "ratio_max_dev": (rho - 1.0).abs().max(),
-        "log_ratio_p05": logs.nanquantile(0.05),
-        "log_ratio_p50": logs.nanquantile(0.5),
-        "log_ratio_p95": logs.nanquantile(0.95),
+        "ratio_max_dev": deviation.max(),
         "explained_variance": explained.masked_fill(spread <= VARIANCE_FLOOR, 0.0),
     }
 
 
-def lag_metrics(version: Tensor, trainer_version: int) -> Metrics:
+def lag_metrics(version: np.ndarray, trainer_version: int) -> Metrics:
     """How stale a batch is, in updates; `version`, int (N,), is of the weights behind each decision."""
-    lag = (trainer_version - version).float()
-    return {"lag_mean": float(lag.mean()), "lag_p95": float(lag.quantile(0.95)), "lag_max": float(lag.max())}
+    lag = trainer_version - version
+    return {"lag_mean": float(lag.mean()), "lag_max": float(lag.max())}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossOutput:
-    """Loss and metrics of one batch."""
+    """Loss of one batch, and what its metrics are computed from."""
 
     loss: Tensor  # (), call ``backward`` on it
     means: dict[str, Tensor]  # means over decisions, scalars without gradient
     samples: Tensor
-    """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
-    of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
-    clip: tuple[float, float]  # (low, high) of the clip range
-
-    @property
-    def metrics(self) -> dict[str, Tensor]:
-        """Scalars of this batch, still on the device."""
-        return self.means | sample_metrics(self.samples, self.clip)
+    """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions: of each ratio
+    log ρ, ω and 1 if it exists, else 0; V; R."""
 
 
 def assemble(
-    inputs: LossInputs,
-    config: RatioConfig,
-    *,
-    policy_loss: Tensor,
-    log_ratio: Tensor,
-    weight: Tensor,
-    clip: tuple[float, float] = USUAL_CLIP,
+    inputs: LossInputs, config: RatioConfig, *, policy_loss: Tensor, log_ratio: Tensor, weight: Tensor
 ) -> LossOutput:
-    """Adds the shared terms to a policy loss and measures the batch, with `clip` (low, high).
+    """Adds the shared terms to a policy loss and measures the batch.
 
     `log_ratio` (N, F), log π/μ with gradient, is from `at_level`; `weight` (N, F) is how much of each
     sample's gradient the algorithm keeps, ω.
@@ -188,12 +170,10 @@ def assemble(
         "entropy": mean_entropy,
     }
     means = {name: mean.detach() for name, mean in means.items()}
-    exists = torch.ones_like(log_ratio)
-    if inputs.factors is not None:
-        exists = present(inputs.factors, config.level)
+    exists = present(inputs.factors, config.level)
     columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
     samples = torch.cat([column.detach().double() for column in columns], 1)
-    return LossOutput(loss=loss, means=means, samples=samples, clip=clip)
+    return LossOutput(loss=loss, means=means, samples=samples)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,5 +258,4 @@ class PPOConfig(RatioConfig):
             policy_loss=-mean_over_ratios(surrogate, inputs, self.level),
             log_ratio=logs,
             weight=(~dropped).to(logs.dtype),
-            clip=(self.clip_low, self.clip_high),
         )

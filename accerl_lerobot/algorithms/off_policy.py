@@ -30,7 +30,7 @@ from accerl_lerobot.policies.stock import StockAdapter
 POLICY_BATCH = 64  # rows of one step of the policy
 CAP = 20.0  # largest weight of a decision in AWR, the paper's
 FORGET = 0.99  # share of the mean square of R − V that a step keeps
-FIRST = 1024  # rows that a column has space for at first; doubled when they are full
+FIRST = 1024  # rows that a column has space for at first; a full one doubles
 
 
 class Memory:
@@ -97,9 +97,8 @@ class Memory:
         """Sets rows of a column, after making space in it for all rows so far."""
         column = self._columns.get(name, values[:0])
         if len(column) < len(self):
-            size = max(FIRST, len(self), 2 * len(column))
-            missing = min(size, self.capacity) - len(column)
-            space = np.zeros((missing, *values.shape[1:]), values.dtype)
+            size = min(max(FIRST, 2 * len(self)), self.capacity)
+            space = np.zeros((size - len(column), *values.shape[1:]), values.dtype)
             column = np.concatenate([column, space])
             self._columns[name] = column
         column[rows] = values
@@ -134,8 +133,7 @@ class OffPolicyUpdate(BaseUpdate):
     def __init__(
         self, adapter: LeRobotAdapter | StockAdapter, algorithm: OffPolicyConfig, config: TrainerConfig
     ) -> None:
-        super().__init__(adapter, config)
-        self.policy_steps = algorithm.policy_steps
+        super().__init__(adapter, algorithm, config)
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
         self._pending_steps: dict[str, float] = {}
 
@@ -146,17 +144,17 @@ class OffPolicyUpdate(BaseUpdate):
         for segment in segments:
             self.remember(segment)
         rewards = np.concatenate([segment.reward for segment in segments])
-        metrics = {
-            "decisions": float(len(rewards)),
-            "memory_decisions": float(len(self.memory)),
+        metrics: Metrics = {
+            "decisions": len(rewards),
+            "memory_decisions": len(self.memory),
             "reward_mean": float(rewards.mean()),
         }
         metrics |= self.learn(len(rewards))
         # Lag is that of the new decisions only: those that the steps draw from the memory may be much older.
         versions = np.concatenate([segment.version for segment in segments])
-        metrics |= lag_metrics(torch.from_numpy(versions), self.version)
+        metrics |= lag_metrics(versions, self.version)
         self.version += 1
-        metrics["skipped"] = float(self.skipped)
+        metrics["skipped"] = self.skipped
         return metrics
 
     def learn(self, new: int) -> Metrics:
@@ -167,7 +165,7 @@ class OffPolicyUpdate(BaseUpdate):
         metrics = {"lr": lr}
         rows = self.imitable()
         if self.version >= start and len(rows):
-            steps = self.steps("policy", self.policy_steps, new)
+            steps = self.steps("policy", self.algorithm.policy_steps, new)
             metrics |= mean(self._policy_step(rows) for _ in steps)
         return metrics
 
@@ -245,7 +243,6 @@ class AWRUpdate(OffPolicyUpdate):
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: AWRConfig, config: TrainerConfig) -> None:
         super().__init__(adapter, algorithm, config)
-        self.algorithm = algorithm
         self._variance = 0.0  # mean square of R − V, over some hundred steps
         self.optimizer.add_param_group({"params": self._value, "lr": config.value_lr})
 

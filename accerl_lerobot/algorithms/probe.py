@@ -24,7 +24,6 @@ from accerl_lerobot.experience import Metrics
 from accerl_lerobot.policies.adapter import PolicyAdapter
 
 CRITIC_PREFIX = "value_head."  # how names of the critic's weights begin
-CLIP = 0.2  # PPO's usual range: a mismatch outside it would be clipped as if the policy had moved
 
 
 class Probe:
@@ -75,10 +74,8 @@ class Probe:
                 apart = ranks.over_rows(partial(self._apart, batch), rows, self._config.micro_batch)
             finally:
                 self._exchange()
-            clipped = apart.expm1().abs() > CLIP
-            metrics["logprob/mismatch_mean"] = float(apart.abs().mean())
-            metrics["logprob/mismatch_max"] = float(apart.abs().max())
-            metrics["logprob/mismatch_clip"] = float(clipped.double().mean())
+            metrics["logprob/mismatch_mean"] = float(apart.mean())
+            metrics["logprob/mismatch_max"] = float(apart.max())
         elif skipped:
             self._next = 0
         else:
@@ -89,14 +86,14 @@ class Probe:
 
     @torch.no_grad()
     def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
-        """Σ log π − Σ log μ of each row, float64, with π of the copy."""
+        """|Σ log π − Σ log μ| of each row, float64, with π of the copy."""
         observations, tasks, latent = batch.part(rows)
         log_prob = self.adapter.evaluate(observations, tasks, latent).log_prob.cpu()
         difference = log_prob - batch.log_prob[rows]
         factors = self.adapter.factors(latent)
         if factors is not None:
             difference = difference.masked_fill(~factors.cpu(), 0.0)
-        return difference.double().sum(dim=-1)
+        return difference.double().sum(dim=-1).abs()
 
     @torch.no_grad()
     def _exchange(self) -> None:

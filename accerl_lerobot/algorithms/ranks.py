@@ -79,13 +79,11 @@ def gather(local: Tensor, total: int) -> Tensor:
     """All ranks' rows, from each one's own: (total, ...), on the CPU in the order of `np.array_split`."""
     if size() == 1:
         return local
-    counts = [len(share) for share in np.array_split(np.arange(total), size())]
-    padded = local.new_zeros((counts[0], *local.shape[1:]))
-    padded[: len(local)] = local
-    parts = [torch.empty_like(padded) for _ in counts]
-    dist.all_gather(parts, padded)
-    own = [part[:count] for part, count in zip(parts, counts, strict=True)]
-    return torch.cat(own)
+    shares = np.array_split(np.arange(total), size())
+    rows = local.new_zeros((total, *local.shape[1:]))
+    rows[shares[rank()]] = local
+    dist.all_reduce(rows)
+    return rows
 
 
 def over_rows(score: Callable[[np.ndarray], Tensor], rows: np.ndarray, at_once: int) -> Tensor:

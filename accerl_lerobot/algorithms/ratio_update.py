@@ -18,14 +18,15 @@ a segment is 0 if the episode *terminated*, by its time limit too. It is V of th
 decision if the segment was cut in mid-episode. `normalise` works on the whole batch: per micro-batch it would
 compare a decision only with its neighbours.
 
-Shapes: S segments, T decisions of the longest one, N decisions in all.
+Shapes: S segments, N decisions in all.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,14 +59,14 @@ def make_update(adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig)
 class BaseUpdate(ABC):
     """The optimiser around one adapter, and what the updates of all algorithms share."""
 
-    def __init__(self, adapter: Any, config: TrainerConfig) -> None:
+    def __init__(self, adapter: Any, algorithm: Any, config: TrainerConfig) -> None:
         ranks.prepare(adapter, config)
         self.adapter = adapter
+        self.algorithm = algorithm
         self.config = config
         self.version = 0  # updates made
         self.skipped = 0
         self._skipped_in_a_row = 0
-        self._schedule_updates = config.updates
         self._policy: list[nn.Parameter] = []
         self._value: list[nn.Parameter] = []
         for name, parameter in adapter.trainable().items():
@@ -87,7 +88,7 @@ class BaseUpdate(ABC):
             "version": self.version,
             "skipped": self.skipped,
             "skipped_in_a_row": self._skipped_in_a_row,
-            "schedule_updates": self._schedule_updates,
+            "schedule_updates": self.config.updates,
             "optimizer": optimizer_state(self.optimizer),
         }
 
@@ -96,13 +97,13 @@ class BaseUpdate(ABC):
         self.version = state["version"]
         self.skipped = state["skipped"]
         self._skipped_in_a_row = state["skipped_in_a_row"]
-        self._schedule_updates = state["schedule_updates"]
+        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
+        self.config = replace(self.config, updates=state["schedule_updates"])
         restore_optimizer(self.optimizer, state["optimizer"])
 
     def lr_share(self, start: int = 0) -> float:
         """Share of the peak of a learning rate that begins with update `start`."""
-        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
-        return self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
+        return self.config.lr_share(self.version, start)
 
     def apply(self, optimizer: torch.optim.Optimizer, step: str, loss: float, norm: float) -> None:
         """Makes a step, unless its loss or its gradient's norm is not finite; those are counted.
@@ -110,9 +111,10 @@ class BaseUpdate(ABC):
         Raises:
             NonFiniteError: `errors.MAX_NONFINITE` of them since the policy's last step.
         """
-        self.skipped += not math.isfinite(loss + norm)
         hint = "lower trainer.lr or trainer.value_lr"
         in_a_row = step_if_finite(optimizer, step, loss, norm, self._skipped_in_a_row, hint)
+        if in_a_row:
+            self.skipped += 1
         if in_a_row or optimizer is self.optimizer:
             self._skipped_in_a_row = in_a_row
 
@@ -121,8 +123,7 @@ class RatioUpdate(BaseUpdate):
     """Updates by a likelihood ratio."""
 
     def __init__(self, adapter: PolicyAdapter, algorithm: RatioConfig, config: TrainerConfig) -> None:
-        super().__init__(adapter, config)
-        self.algorithm = algorithm
+        super().__init__(adapter, algorithm, config)
         self.optimizer.add_param_group({"params": self._value})
         self._moments = torch.zeros(3, dtype=torch.float64)  # of the advantages so far
         self._probe = Probe(adapter, config)
@@ -134,19 +135,20 @@ class RatioUpdate(BaseUpdate):
         rows = np.arange(len(batch))
         parts = ranks.split_rows(rows, self.config.micro_batch, ranks.rank(), ranks.size())
         following = self._values(batch.last_observations, batch.segment_tasks)
-        evaluation: Evaluation | None = None
+        evaluations: Iterable[Evaluation] = (self.adapter.evaluate(*batch.part(part.rows)) for part in parts)
         if len(parts) == 1:  # the forward pass of a single micro-batch has the values
-            evaluation = self.adapter.evaluate(*batch.part(parts[0].rows))
+            (evaluation,) = evaluations
+            evaluations = [evaluation]
             local_values = evaluation.value.detach().cpu().float()
             values = ranks.gather(parts[0].counted(local_values), len(batch))
         else:
             values = self._values(batch.observations, batch.tasks)
         advantages, returns = self._targets(batch, values, following)
-        metrics = self._backward(batch, parts, evaluation, advantages, returns)
+        metrics = self._backward(batch, parts, evaluations, advantages, returns)
         fault_point("trainer.backward")
         metrics |= self._step(metrics["loss"])
         metrics |= mismatch
-        metrics |= lag_metrics(torch.from_numpy(batch.version), self.version)
+        metrics |= lag_metrics(batch.version, self.version)
         self.version += 1
         self._probe.renew(self.version)
         return metrics
@@ -173,50 +175,41 @@ class RatioUpdate(BaseUpdate):
 
     def _targets(self, batch: Batch, values: Tensor, following: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised advantages, and returns, each (N,), from V before each decision and V after the last."""
-        mask = decision_mask(batch.lengths, int(batch.lengths.max()))
-        padding = torch.zeros(mask.shape)
         advantages, returns = gae(
-            padding.masked_scatter(mask, batch.reward.float()),
-            padding.masked_scatter(mask, values.float()),
+            batch.reward,
+            values,
             following,
             batch.terminated,
             batch.lengths,
             gamma=self.algorithm.gamma,
             lam=self.algorithm.lam,
         )
-        total = self.config.advantage_memory * self._moments + moments(advantages, mask)
-        if bool(torch.isfinite(total).all()):  # a batch that is not finite is skipped, and must be forgotten
+        total = self.config.advantage_memory * self._moments + moments(advantages)
+        if total.isfinite().all():  # a batch that is not finite is skipped, and must be forgotten
             self._moments = total
-        return normalise(advantages, total, mask)[mask], returns[mask]
+        return normalise(advantages, total), returns
 
     def _backward(
         self,
         batch: Batch,
         parts: Sequence[Part],
-        only: Evaluation | None,
+        evaluations: Iterable[Evaluation],
         advantages: Tensor,
         returns: Tensor,
     ) -> Metrics:
         """Accumulates the gradient of the loss over micro-batches; returns metrics of the whole batch.
 
-        `only` is the evaluation of a single micro-batch.
+        `evaluations` are of the parts, each made when its turn comes.
         """
         factors = self.adapter.factors(batch.latent)
-        ratios = None
-        if factors is not None:
-            count = present(factors, self.algorithm.level).sum()
-            ratios = float(count) / len(factors)
+        if factors is None:
+            factors = torch.ones(batch.log_prob.shape, dtype=torch.bool)
+        ratios = float(present(factors, self.algorithm.level).sum()) / len(batch)
         means: Metrics = {}
         samples: list[Tensor] = []
-        for part in parts:
+        for part, evaluation in zip(parts, evaluations, strict=True):
             rows = part.rows
-            evaluation = only
-            if evaluation is None:
-                evaluation = self.adapter.evaluate(*batch.part(rows))
             device = evaluation.log_prob.device
-            part_factors = None
-            if factors is not None:
-                part_factors = factors[rows].to(device)
             inputs = LossInputs(
                 log_prob_new=evaluation.log_prob,
                 log_prob_old=batch.log_prob[rows].to(device),
@@ -224,7 +217,7 @@ class RatioUpdate(BaseUpdate):
                 value=evaluation.value,
                 returns=returns[rows].to(device),
                 entropy=evaluation.entropy,
-                factors=part_factors,
+                factors=factors[rows].to(device),
                 ratios_per_decision=ratios,
             )
             output = self.algorithm.loss(inputs)
@@ -242,9 +235,9 @@ class RatioUpdate(BaseUpdate):
             ranks.average_gradients(self._policy + self._value)
         metrics = self._whole_means(means)
         all_samples = ranks.gather(torch.cat(samples), len(batch))
-        for name, value in sample_metrics(all_samples, output.clip).items():
+        for name, value in sample_metrics(all_samples).items():
             metrics[name] = float(value)
-        metrics["decisions"] = float(len(batch))
+        metrics["decisions"] = len(batch)
         metrics["return_mean"] = float(returns.mean())
         metrics["reward_mean"] = float(batch.reward.mean())
         return metrics
@@ -274,7 +267,7 @@ class RatioUpdate(BaseUpdate):
             "value_grad_norm": value_norm,
             "lr": lr,
             "value_lr": value_lr,
-            "skipped": float(self.skipped),
+            "skipped": self.skipped,
         }
 
     def _clip(self, parameters: list[nn.Parameter]) -> float:
@@ -285,62 +278,49 @@ class RatioUpdate(BaseUpdate):
         return float(norm)
 
 
-def decision_mask(lengths: Tensor, t: int) -> Tensor:
-    """bool (S, t), True where a segment of one of the `lengths` (S,) still has a decision."""
-    return torch.arange(t, device=lengths.device) < lengths[:, None]
-
-
 def gae(
     rewards: Tensor,
     values: Tensor,
     bootstrap_value: Tensor,
     terminated: Tensor,
-    lengths: Tensor,
+    lengths: Sequence[int],
     *,
     gamma: float,
     lam: float,
 ) -> tuple[Tensor, Tensor]:
-    """Advantages and returns, each (S, T) and 0 at padding, of segments of `lengths` (S,), without gradient.
+    """Advantages and returns, each (N,), of S segments of `lengths` decisions that are laid end to end.
 
-    `rewards` (S, T) are summed over each chunk, `values` (S, T) are V before each decision; padding may hold
-    anything, NaN included. `bootstrap_value` (S,), V after the last one, does not count where `terminated`,
-    bool (S,): True if the episode is over, False for segments cut in mid-episode.
+    `rewards` (N,) are summed over each chunk, `values` (N,) are V before each decision. `bootstrap_value`
+    (S,), V after the last one, does not count where `terminated`, bool (S,): True if the episode is over,
+    False for segments cut in mid-episode.
     """
-    t = rewards.shape[1]
-    padding = ~decision_mask(lengths, t)
-    rewards = rewards.detach().masked_fill(padding, 0.0)
-    values = values.detach().masked_fill(padding, 0.0)
-    after = bootstrap_value.detach().masked_fill(terminated, 0.0)
-    last = lengths[:, None] - 1
-    next_values = values.roll(-1, dims=1).scatter(1, last, after[:, None])
-    delta = rewards + gamma * next_values - values
-
-    advantages = delta.masked_fill(padding, 0.0)
-    for i in reversed(range(t - 1)):
-        advantages[:, i] += gamma * lam * advantages[:, i + 1]
-    returns = advantages + values
-    return advantages, returns.masked_fill(padding, 0.0)
+    last = torch.tensor(lengths).cumsum(0) - 1
+    next_values = values.roll(-1)
+    next_values[last] = bootstrap_value.masked_fill(terminated, 0.0)
+    advantages = rewards + gamma * next_values - values
+    for segment in advantages.split(list(lengths)):  # views, from δ to Â
+        for i in reversed(range(len(segment) - 1)):
+            segment[i] += gamma * lam * segment[i + 1]
+    return advantages, advantages + values
 
 
-def moments(x: Tensor, mask: Tensor) -> Tensor:
-    """(sum, sum of squares, count) of the entries where `mask` is True, (3,); others may be NaN.
+def moments(x: Tensor) -> Tensor:
+    """(sum, sum of squares, count) of the entries, (3,).
 
     In float64, because the variance is the difference of two nearly equal numbers when the mean is large.
     """
-    wide = x.detach().double().masked_fill(~mask, 0.0)
-    count = mask.sum().double()
-    return torch.stack([wide.sum(), wide.square().sum(), count])
+    wide = x.double()
+    return torch.stack([wide.sum(), wide.square().sum(), torch.ones_like(wide).sum()])
 
 
-def normalise(x: Tensor, moments: Tensor, mask: Tensor) -> Tensor:
-    """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`; 0 where `mask` is False.
+def normalise(x: Tensor, moments: Tensor) -> Tensor:
+    """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`.
 
     `moments` (3,) is of everything that is compared with each other.
     """
     total, squares, count = moments.unbind()
-    count = count.clamp(min=1.0)
     mean = total / count
     variance = squares / count - mean.square()
     std = variance.clamp(min=0.0).sqrt()
-    scaled = (x.detach().double() - mean) / (std + STD_EPSILON)
-    return scaled.to(x.dtype).masked_fill(~mask, 0.0)
+    scaled = (x.double() - mean) / (std + STD_EPSILON)
+    return scaled.to(x.dtype)

@@ -131,7 +131,7 @@ def main() -> None:
     finally:
         sys.stderr.flush()
         answer["warnings"] = errors.collected_warnings()
-        sys.stdout.write(f"\n{ANSWER}{json.dumps(answer)}\n")
+        sys.stdout.write(f"\n{ANSWER}{json.dumps(answer, default=str)}\n")
 
 
 if __name__ == "__main__":

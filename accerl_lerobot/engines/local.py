@@ -20,18 +20,11 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
-from accerl_lerobot.experience import REAL, Decision, Request, Segment
+from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.rollout.runner import (
-    MOST_STARTS,
-    EpisodePlan,
-    EpisodePlans,
-    EpisodeResult,
-    RolloutRunner,
-    Starts,
-)
+from accerl_lerobot.rollout.runner import MOST_STARTS, EpisodePlan, EpisodePlans, RolloutRunner, Starts
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 
@@ -66,9 +59,7 @@ class LocalEngine(Engine):
         journal = None if config.folder is None else Journal(config.folder / EPISODES)
         self._replay = Replay(config.replay, journal)
         self._rng = np.random.default_rng(config.seed)
-        self._episodes: list[EpisodeResult] = []
         self._training = False
-        self._outbox: deque[Segment] = deque()
         count = config.rollout.environments * config.rollout.workers
         environments = [
             make_environment(config.env, history, config.rollout.reward_model) for _ in range(count)
@@ -87,9 +78,7 @@ class LocalEngine(Engine):
             if config.imagination.learns:
                 self._world_learner = make_trainer(config)
         self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
-        self._runner = RolloutRunner(
-            environments, self._next, config.rollout, "local", self._outbox.append, self._end, starts
-        )
+        self._runner = RolloutRunner(environments, self._plans, config.rollout, starts)
         if state is not None:
             self._restore(state)
         self._clock.enter(WAIT_IN)
@@ -115,15 +104,15 @@ class LocalEngine(Engine):
                 metrics["update"] = float(self._update.version)
                 updates.append(metrics)
         self._clock.enter(WAIT_IN)
-        episodes = self._episodes
-        self._episodes = []
+        episodes = list(self._runner.results)
+        self._runner.results.clear()
         learner = self._world_learner
         return Progress(
             version=self._update.version,
             done=self._training and not self._exploring,
             updates=updates,
             episodes=episodes,
-            rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
+            rollout=asdict(self._runner.counters),
             replay=self._replay.metrics(),
             world_model={} if learner is None else learner.metrics(),
             inference={"version": float(self._update.version)},
@@ -139,7 +128,7 @@ class LocalEngine(Engine):
         engine = {
             "generators": global_generators(),
             "rng": self._rng,
-            "outbox": list(self._outbox),
+            "outbox": list(self._runner.segments),
             "plans": self._plans.state(),
             "runner": self._runner.state(),
         }
@@ -160,7 +149,7 @@ class LocalEngine(Engine):
         self._replay.restore(snapshot.load(directory / "replay"))
         engine = snapshot.load(directory / self.state_name)
         self._rng = engine["rng"]
-        self._outbox.extend(engine["outbox"])
+        self._runner.segments.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
         if self._world_learner is not None:
@@ -178,15 +167,6 @@ class LocalEngine(Engine):
         except Exception:
             logger.exception("could not close all environments")
 
-    def _next(self, source: str) -> EpisodePlan | None:
-        if source == REAL:
-            return self._plans.next(self._exploring)
-        return self._plans.next_imagined(self._exploring, self._runner.starts)
-
-    def _end(self, result: EpisodeResult) -> None:
-        self._plans.ended(result)
-        self._episodes.append(result)
-
     @property
     def _exploring(self) -> bool:
         if not self._training or self._update.version >= self._config.trainer.updates:
@@ -196,6 +176,7 @@ class LocalEngine(Engine):
     def _act(self) -> None:
         """One decision in every environment that may continue."""
         runner = self._runner
+        self._plans.exploring = self._exploring
         may_explore = self._replay.may_insert()
         due: dict[int, Request] = {}
         for slot in range(len(runner)):
@@ -222,9 +203,10 @@ class LocalEngine(Engine):
             self._world.load(learner.serving.version, learner.serving.state_dict())
 
     def _store(self) -> None:
-        while self._outbox and self._replay.may_insert():
-            segment = self._outbox.popleft()
+        outbox = self._runner.segments
+        while outbox and self._replay.may_insert():
+            segment = outbox.popleft()
             if self._replay.insert(segment) and self._world_learner is not None:
                 self._world_learner.add(segment)
-        if self._world is None and self._plans.spent and not self._outbox and not self._runner.exploring:
+        if self._world is None and self._plans.spent and not outbox and not self._runner.exploring:
             self._replay.ended = True

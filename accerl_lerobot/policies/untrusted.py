@@ -24,7 +24,7 @@ from torch.overrides import TorchFunctionMode
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PREPROCESSOR, check_names
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json, safe_join, texts_in
-from accerl_lerobot.errors import InputError, causes, expanded, in_one_line
+from accerl_lerobot.errors import InputError, causes, expanded, in_one_line, input_error
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
@@ -174,8 +174,3 @@ class Unfilled(TorchFunctionMode):
             zeros = np.zeros(made.nbytes, np.uint8)  # pages that nothing is written to are not there
             return torch.from_numpy(zeros).view(made.dtype).view(made.shape)
         return made
-
-
-def input_error(error: BaseException) -> InputError | None:
-    """The `InputError` that another error wraps, if there is one."""
-    return next((link for link in causes(error) if isinstance(link, InputError)), None)

@@ -31,7 +31,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import State, kind
 from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import REAL, Metrics, Segment
+from accerl_lerobot.experience import REAL, Metrics, Segment, nonfinite
 from accerl_lerobot.replay.journal import Journal
 
 DRAWS = 1024
@@ -66,13 +66,6 @@ class ReplayConfig(Section, section="replay"):
     """Rollouts wait while at least so many stored decisions have draws left; from one batch to `capacity`.
     Where environments end their segments together, room for all of them keeps both sides busy. It costs
     lag."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("min_decisions", "max_unlearned_decisions"):
-            if getattr(self, name) > self.capacity:
-                hint = f"use 1 to capacity, {self.capacity}"
-                raise InputError(f"replay.{name}", getattr(self, name), hint)
 
     @property
     def most_available(self) -> int:
@@ -190,10 +183,6 @@ class Replay:
         self._remainder = 0.0
         self._drawn: deque[tuple[int, list[Entry]]] = deque(maxlen=DRAWS)  # trainer version, and its batch
 
-    @property
-    def segments(self) -> list[Segment]:
-        return [entry.segment for entry in self._entries]
-
     def may_insert(self) -> bool:
         """True if rollouts should bring another segment now; `insert` does not refuse one too many."""
         if self.stored_decisions < self.config.min_decisions:
@@ -220,7 +209,8 @@ class Replay:
 
         A non-finite segment is counted and not stored: False.
         """
-        if not is_finite(segment):
+        # The runner has checked the numbers of the environment.
+        if nonfinite({"log_prob": segment.log_prob, **segment.latent}):
             self.counters.dropped_nonfinite += 1
             return False
         n = len(segment)  # at most the capacity, see `ReplayConfig.check`
@@ -269,11 +259,12 @@ class Replay:
             self._remove(entry, "retired")
 
     def metrics(self) -> Metrics:
-        counts = asdict(self.counters)
-        counts["stored_segments"] = len(self._entries)
-        counts["stored_decisions"] = self.stored_decisions
-        counts["available_decisions"] = self.available_decisions
-        return {name: float(count) for name, count in counts.items()}
+        stored = {
+            "stored_segments": len(self._entries),
+            "stored_decisions": self.stored_decisions,
+            "available_decisions": self.available_decisions,
+        }
+        return asdict(self.counters) | stored
 
     def state(self, version: int | None = None) -> State:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
@@ -349,10 +340,3 @@ def _count_unused(counters: ReplayCounters, how: str) -> None:
         counters.evicted_unused += 1
     else:
         counters.retired_unused += 1
-
-
-def is_finite(segment: Segment) -> bool:
-    """True if log-probs and latents have no NaN or infinity; the runner checks the environment's numbers."""
-    arrays = [segment.log_prob, *segment.latent.values()]
-    floating = [array for array in arrays if np.issubdtype(array.dtype, np.inexact)]
-    return all(np.isfinite(array).all() for array in floating)

@@ -32,9 +32,9 @@ class JournalEntry:
     key: str
     origin: SegmentStart
     actions: np.ndarray  # float32 (env steps, A), as they were executed, one after the other
-    steps: tuple[int, ...]  # env steps of each decision; `rewards` have its cost taken off
-    versions: tuple[int, ...]
-    rewards: tuple[float, ...]
+    steps: list[int]  # env steps of each decision; `rewards` have its cost taken off
+    versions: list[int]
+    rewards: list[float]
     ended: bool  # True if the episode ended with it
     success: bool
 
@@ -88,31 +88,19 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
 
 
 def _entry(line: dict[str, Any]) -> JournalEntry:
-    encoded = base64.b64decode(line["actions"], validate=True)
-    actions = np.frombuffer(encoded, "<f4")
-    steps = tuple(line["steps"])
-    return JournalEntry(
-        key=line["key"],
-        origin=SegmentStart(line["task"], int(line["seed"]), int(line["decision"])),
-        actions=actions.reshape(sum(steps), line["action_dim"]),
-        steps=steps,
-        versions=tuple(line["versions"]),
-        rewards=tuple(line["rewards"]),
-        ended=line["ended"],
-        success=line["success"],
-    )
+    encoded = base64.b64decode(line.pop("actions"), validate=True)
+    actions = np.frombuffer(encoded, "<f4").reshape(sum(line["steps"]), line.pop("action_dim"))
+    origin = SegmentStart(line.pop("task"), line.pop("seed"), line.pop("decision"))
+    return JournalEntry(origin=origin, actions=actions, **line)
 
 
 def whole_episodes(segments: Iterator[JournalEntry]) -> Iterator[list[JournalEntry]]:
     """Episodes of which all segments are there, in the order of their ends."""
     under_way: dict[tuple[str, int], list[JournalEntry]] = {}
     for segment in segments:
-        episode = segment.origin.task, segment.origin.seed
-        if segment.origin.decision == 0:
-            under_way[episode] = []
-        before = under_way.get(episode, [])
-        if sum(len(part.steps) for part in before) != segment.origin.decision:
-            continue  # a segment before this one is missing
-        before.append(segment)
+        task, seed, decision = segment.origin
+        under_way.setdefault((task, seed), []).append(segment)
         if segment.ended:
-            yield under_way.pop(episode)
+            episode = under_way.pop((task, seed))
+            if sum(len(part.steps) for part in episode[:-1]) == decision:  # else some are missing
+                yield episode

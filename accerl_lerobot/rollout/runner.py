@@ -11,7 +11,7 @@ ones, of each task in turn and of failing ones more often, with seeds of this wo
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -31,8 +31,11 @@ from accerl_lerobot.experience import (
     Request,
     Segment,
     SegmentStart,
+    nonfinite,
+    stacked,
 )
 from accerl_lerobot.seeds import noise_seed, train_seed
+from accerl_lerobot.timeline import COMPUTE, Clock, NoClock
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
@@ -110,7 +113,7 @@ class EpisodePlans:
     """The episodes of one worker, in order.
 
     `incarnation` is how often the worker has been restarted, part of the seeds and of its segments' keys;
-    `budget` limits the exploring ones.
+    `budget` limits the exploring ones, which are planned while `exploring`.
     """
 
     def __init__(
@@ -118,6 +121,7 @@ class EpisodePlans:
     ) -> None:
         self.worker = worker
         self.incarnation = incarnation
+        self.exploring = False
         self._tasks = tasks
         self._seed = seed
         self._budget = budget
@@ -135,11 +139,16 @@ class EpisodePlans:
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
 
-    def next(self, exploring: bool) -> EpisodePlan | None:
-        """The episode that a free environment is to run; None: it has to wait."""
+    def next(self, source: str, starts: Starts) -> EpisodePlan | None:
+        """The episode that a free environment of this source is to run; None: it has to wait.
+
+        An imagined one begins at one of `starts`.
+        """
+        if source != REAL:
+            return self._next_imagined(starts)
         if self._queued:
             return self._queued.popleft()
-        if not exploring or self.spent:
+        if not self.exploring or self.spent:
             return None
         if self._budget is not None:
             self._budget -= 1
@@ -153,9 +162,8 @@ class EpisodePlans:
         self._owed[task] -= 1
         return EpisodePlan(task=task, seed=seed, explore=True)
 
-    def next_imagined(self, exploring: bool, starts: Starts) -> EpisodePlan | None:
-        """The same for an imagined environment, which begins at one of `starts`."""
-        if not exploring or not starts:
+    def _next_imagined(self, starts: Starts) -> EpisodePlan | None:
+        if not self.exploring or not starts:
             return None
         number = self.imagined
         self.imagined += 1
@@ -190,8 +198,8 @@ class EpisodePlans:
         self.starts = state["starts"]
         self.imagined = state["imagined"]
         self._queued.extend(state["queued"])
-        self._failing = dict(state["failing"])
-        self._owed = dict(state["owed"])
+        self._failing = state["failing"]
+        self._owed = state["owed"]
 
 
 @kind
@@ -267,14 +275,10 @@ class ActiveEpisode:
         self.observations = self.observations[-1:]
         decisions, actions, rewards, steps = zip(*self.taken, strict=True)
         self.taken = []
-        arrays = {}
-        for name in observations[0]:
-            if name != TASK:
-                arrays[name] = np.stack([np.asarray(each[name]) for each in observations])
         return Segment(
-            observations=arrays,
+            observations=stacked(observations),
             task=str(observations[0][TASK]),
-            latent={name: np.stack([d.latent[name] for d in decisions]) for name in decisions[0].latent},
+            latent=stacked([d.latent for d in decisions]),
             log_prob=np.stack([d.log_prob for d in decisions]).astype(np.float32),
             actions=np.stack(actions).astype(np.float32),
             reward=np.array(rewards, np.float32),
@@ -292,23 +296,23 @@ class ActiveEpisode:
 
 @dataclass(eq=False)
 class RolloutRunner:
-    """Drives a set of environments, one per slot, through planned episodes.
+    """Drives a set of environments, one per slot, through the episodes of `plans`.
 
-    `next_plan` is called for each new episode, with the source of the slot's environment; None leaves the
-    slot idle until `start` is called again. `name`, unique per incarnation of a worker, is the prefix of its
-    segments' keys. `on_segment` receives finished segments of exploring episodes, `on_episode` every finished
-    episode. `starts` takes the tasks and first observations of real exploring episodes.
+    A slot for which none is planned stays idle until `start` is called again. `segments`, of exploring
+    episodes, and `results`, of all episodes, are there to be taken. `starts` gets the tasks and first
+    observations of real exploring episodes. `clock` enters `COMPUTE` when an episode begins.
     """
 
     environments: Sequence[Environment]
-    next_plan: Callable[[str], EpisodePlan | None]
+    plans: EpisodePlans
     config: RolloutConfig
-    name: str
-    on_segment: Callable[[Segment], object]
-    on_episode: Callable[[EpisodeResult], object]
     starts: Starts = field(default_factory=lambda: deque(maxlen=MOST_STARTS))
+    clock: Clock = field(default_factory=NoClock)
 
     def __post_init__(self) -> None:
+        # Filled and emptied on different threads: appending to and popping from a deque is atomic.
+        self.segments: deque[Segment] = deque()
+        self.results: deque[EpisodeResult] = deque()
         self.counters = Counters()
         self._episodes: list[ActiveEpisode | None] = [None] * len(self.environments)
         self._sequence = 0
@@ -328,10 +332,11 @@ class RolloutRunner:
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
         environment = self.environments[slot]
-        plan = self.next_plan(environment.source)
+        plan = self.plans.next(environment.source, self.starts)
         if plan is None:
             self._episodes[slot] = None
             return None
+        self.clock.enter(COMPUTE)
         observation = environment.reset(plan.seed, plan.task)
         episode = ActiveEpisode(plan, environment.spec.max_steps, [observation])
         self._episodes[slot] = episode
@@ -365,9 +370,10 @@ class RolloutRunner:
         episode.add(decision, actions, reward, result.steps, result.observation)
         if result.done or len(episode.taken) >= self.config.segment_length:
             self._sequence += 1
-            segment = episode.cut(f"{self.name}.{self._sequence}", result.done, result.success)
+            key = f"rollout{self.plans.worker}.{self.plans.incarnation}.{self._sequence}"
+            segment = episode.cut(key, result.done, result.success)
             if episode.plan.explore:
-                self.on_segment(segment)
+                self.segments.append(segment)
         if result.done:
             self._dropped = 0
             self._finish(episode, result.success, result.note)
@@ -448,7 +454,8 @@ class RolloutRunner:
             frames=episode.frames,
             note=note,
         )
-        self.on_episode(result)
+        self.plans.ended(result)
+        self.results.append(result)
 
 
 def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
@@ -467,13 +474,3 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
-
-
-def nonfinite(observation: Observation) -> str:
-    """The first name in an observation whose numbers are not finite; empty: there is none."""
-    for name, value in observation.items():
-        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
-            continue
-        if not np.isfinite(value).all():
-            return name
-    return ""

@@ -15,11 +15,10 @@ LeRobot, unless its environment does.
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,7 @@ import numpy as np
 
 from accerl_lerobot import errors
 from accerl_lerobot.envs import EnvConfig, make_environment
-from accerl_lerobot.experience import REAL, Decision, Request, Segment
+from accerl_lerobot.experience import REAL, Decision, Request
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.rollout.runner import (
     MOST_STARTS,
@@ -85,12 +84,8 @@ class RolloutWorker:
         self._config = config
         self._spent = False
         self._max_pending = MAX_PENDING
-        # Shared by the two threads: appending to and popping from a deque is atomic.
-        self._results: deque[EpisodeResult] = deque()
-        self._training = threading.Event()
         self._active: tuple[float, bool] | None = None  # since when the thread does what, see `Report`
         self._moves = 0
-        self._outbox: list[Segment] = []
         self._idle: list[int] = []  # slots without an episode
         self._due: dict[int, Request] = {}  # slot → request to be sent
         self._asked: dict[int, list[int]] = {}  # ticket of a message to inference → its slots
@@ -118,15 +113,7 @@ class RolloutWorker:
                 for task, seed in begun:
                     observation = self._environments[0].reset(seed, task)
                     self._starts.append((task, observation))
-            self._runner = RolloutRunner(
-                self._environments,
-                self._next,
-                self._config,
-                f"rollout{plans.worker}.{plans.incarnation}",
-                self._outbox.append,
-                self._end,
-                self._starts,
-            )
+            self._runner = RolloutRunner(self._environments, plans, self._config, self._starts, self._clock)
         return os.getpid()
 
     def imagine_with(self, newest: tuple[int, Any]) -> None:
@@ -142,15 +129,13 @@ class RolloutWorker:
         self._clock.beat()
         self._plans.queue(plans)
         self._max_pending = 1 if in_turn else MAX_PENDING
-        if training:
-            self._training.set()
-        else:
-            self._training.clear()
+        self._plans.exploring = training
         now = time.monotonic()
         since, in_environment = self._active or (now, False)
+        ended = self._runner.results
         return Report(
-            episodes=[self._results.popleft() for _ in range(len(self._results))],
-            counters={k: float(v) for k, v in vars(self._runner.counters).items()},
+            episodes=[ended.popleft() for _ in range(len(ended))],
+            counters=asdict(self._runner.counters),
             busy_s=now - since,
             in_environment=in_environment,
             moves=self._moves,
@@ -179,20 +164,20 @@ class RolloutWorker:
             self._execute_decisions(deciding)
 
     def _send_segments(self, storing: Client) -> None:
-        while self._outbox:
+        outbox = self._runner.segments
+        while outbox:
             self._clock.enter(TRANSPORT)
-            segments = self._outbox[: self._together]
+            segments = [outbox.popleft() for _ in range(min(len(outbox), self._together))]
             if fault_point("rollout.send"):
                 segments[0].reward = segments[0].reward * np.float32(np.nan)
             ticket = storing.send(segments)
             self._pending[ticket] = any(segment.source == REAL for segment in segments)
-            del self._outbox[: self._together]
         unstored = any(self._pending.values())
         self._spent = self._plans.spent and not self._runner.exploring and not unstored
 
     def _begin_episodes(self) -> None:
         """In every idle slot; once training has ended, also where an exploring episode is under way."""
-        if not self._training.is_set():
+        if not self._plans.exploring:
             for slot, request in list(self._due.items()):
                 if request.explore:
                     del self._due[slot]
@@ -223,16 +208,6 @@ class RolloutWorker:
                 if not self._step(slot, decision):
                     self._idle.append(slot)
 
-    def _next(self, source: str) -> EpisodePlan | None:
-        exploring = self._training.is_set()
-        if source == REAL:
-            plan = self._plans.next(exploring)
-        else:
-            plan = self._plans.next_imagined(exploring, self._starts)
-        if plan is not None:
-            self._clock.enter(COMPUTE)
-        return plan
-
     def _imagine(self, config: ImaginationConfig) -> None:
         """Add the imagined environments."""
         import torch
@@ -243,10 +218,6 @@ class RolloutWorker:
         spec = self._environments[0].spec
         self._world, imagined = imagined_environments(config, config.environments, spec, self._starts)
         self._environments += imagined
-
-    def _end(self, result: EpisodeResult) -> None:
-        self._plans.ended(result)
-        self._results.append(result)
 
     def _step(self, slot: int, decision: Decision | None) -> bool:
         """Begin an episode, or execute a decision; False if nothing is due in this slot then."""

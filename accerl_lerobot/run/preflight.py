@@ -29,7 +29,7 @@ from accerl_lerobot.envs import (
     make_environment,
 )
 from accerl_lerobot.errors import InputError, causes
-from accerl_lerobot.experience import Observation
+from accerl_lerobot.experience import Observation, nonfinite
 from accerl_lerobot.policies.features import (
     ACTION,
     ENV_STATE,
@@ -43,7 +43,6 @@ from accerl_lerobot.policies.features import (
     policy_features,
     resizes,
 )
-from accerl_lerobot.rollout.runner import nonfinite
 from accerl_lerobot.world_model.config import SimulatorStateConfig
 
 if TYPE_CHECKING:

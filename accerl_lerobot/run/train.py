@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.machine import check_disk
@@ -40,7 +39,7 @@ from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
 from accerl_lerobot.envs import EnvironmentSpec
-from accerl_lerobot.errors import InputError, check_absent, expanded, kept_traceback, printable
+from accerl_lerobot.errors import InputError, check_absent, expanded, kept_traceback
 from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
@@ -237,7 +236,6 @@ class Run:
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
-        guardian.explain(printable(f"to resume: {self.how}"))
         try:
             with redirect_stdout(sys.stderr), kept_traceback(self.directory), resuming.locked(self.directory):
                 return self.execute()
@@ -251,8 +249,6 @@ class Run:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             self.console.say(f"{reason}; to resume: {self.how}")
             raise
-        finally:
-            guardian.explain("")
 
     def execute(self) -> dict[str, Any]:
         """Do all phases; returns the summary, which is also in ``summary.json``."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import Decision, Observation, Request, stack_observations
+from accerl_lerobot.experience import Decision, Observation, Request, stack_observations, stacked
 from accerl_lerobot.policies.adapter import LeRobotAdapter, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
@@ -98,10 +98,10 @@ def check_alike(found: Sequence[Decision], expected: Sequence[Decision]) -> None
     mine["chunk"] = _chunks(found)
     theirs["chunk"] = _chunks(expected)
     for name, tensor in theirs.items():
-        error = float((mine[name] - tensor).abs().max())
-        size = float(tensor.abs().max())
-        most = TOLERANCE * size if tensor.is_floating_point() else 0
-        where = f"{name} is off by {error:.2e} where the largest is {size:.2e}"
+        error = (mine[name] - tensor).abs().max()
+        largest = tensor.abs().max()
+        most = TOLERANCE * largest if tensor.is_floating_point() else 0
+        where = f"{name} is off by {error:.2e} where the largest is {largest:.2e}"
         assert error <= most, f"of two decisions on one request, {where}"
 
 
@@ -207,10 +207,9 @@ def perturb(adapter: PolicyAdapter, scale: float, seed: int = 0) -> None:
 
 def stored(decisions: Sequence[Decision]) -> tuple[dict[str, Tensor], Tensor]:
     """(latents, log-probs (B, L)) of decisions, as a batch."""
-    latent = {}
-    for name in decisions[0].latent:
-        latent[name] = _stacked(decision.latent[name] for decision in decisions)
-    return latent, _stacked(decision.log_prob for decision in decisions)
+    latent = stacked([decision.latent for decision in decisions])
+    log_prob = np.stack([decision.log_prob for decision in decisions])
+    return {name: torch.from_numpy(rows) for name, rows in latent.items()}, torch.from_numpy(log_prob)
 
 
 def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Sequence[Decision]) -> Tensor:
@@ -223,8 +222,4 @@ def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Seque
 
 
 def _chunks(decisions: Sequence[Decision]) -> Tensor:
-    return _stacked(decision.chunk for decision in decisions)
-
-
-def _stacked(rows: Iterable[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.stack(list(rows)))
+    return torch.from_numpy(np.stack([decision.chunk for decision in decisions]))

@@ -59,12 +59,8 @@ class LinearAdapter(PolicyAdapter):
         critic = {f"value_head.{k}": p for k, p in self.value_head.named_parameters()}
         return {"policy.weight": self.weight, **critic}
 
-    def copy(self) -> dict[str, Tensor]:
-        """The weights as they are now."""
-        return {k: p.detach().clone() for k, p in self.trainable().items()}
-
     def copy_weights(self) -> dict[str, Tensor]:
-        return self.copy()
+        return {k: p.detach().clone() for k, p in self.trainable().items()}
 
     def save(self, directory: Path, weights: dict[str, Tensor]) -> None:
         snapshot.save(directory / "linear", weights)

@@ -62,22 +62,14 @@ def critic_values(update: RatioUpdate, segments: Sequence[Segment]) -> list[np.n
 
 
 def test_collate_lays_segments_end_to_end():
+    """Each decision beside the observation it was made on; the extra one is the bootstrap's."""
     segments = make_segments((2, 3), version=4)
-    segments[1].terminated = True
     batch = collate(segments)
-    assert batch.reward.shape == (5,) and batch.log_prob.shape == (5, 2) and batch.latent["x"].shape == (5, 2)
-    np.testing.assert_array_equal(batch.reward.numpy()[2:], segments[1].reward)
-    # Each decision stands beside the observation it was made on; the extra one is the bootstrap's.
-    np.testing.assert_array_equal(batch.observations[STATE][:2], segments[0].observations[STATE][:2])
-    np.testing.assert_array_equal(batch.observations[STATE][2:], segments[1].observations[STATE][:3])
-    np.testing.assert_array_equal(batch.last_observations[STATE][0], segments[0].observations[STATE][2])
-    np.testing.assert_array_equal(batch.last_observations[STATE][1], segments[1].observations[STATE][3])
-    assert batch.tasks == ["task 0.0"] * 2 + ["task 0.1"] * 3 and batch.segment_tasks == [
-        "task 0.0",
-        "task 0.1",
-    ]
-    assert batch.lengths.tolist() == [2, 3] and batch.terminated.tolist() == [False, True]
-    assert batch.version.tolist() == [4] * 5
+    one, two = (segment.observations[STATE] for segment in segments)
+    np.testing.assert_array_equal(batch.observations[STATE], np.concatenate([one[:2], two[:3]]))
+    np.testing.assert_array_equal(batch.last_observations[STATE], np.stack([one[2], two[3]]))
+    assert batch.tasks == ["task 0.0"] * 2 + ["task 0.1"] * 3
+    assert batch.segment_tasks == ["task 0.0", "task 0.1"]
 
 
 @pytest.mark.parametrize("micro_batch", [1, 4, 5, 12, 13, 1000])
@@ -139,16 +131,12 @@ def test_advantages_are_normalised_over_the_batch():
     assert_close(*gradients)
 
 
-def test_learning_rates_warm_up_and_stay():
+def test_learning_rates_warm_up_and_fall_like_a_cosine():
     config = replace(PLAIN, warmup_updates=4)
     assert [config.lr_share(i) for i in range(6)] == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
     assert [config.lr_share(i, start=2) for i in range(7)] == [0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0]
-
-
-def test_learning_rates_fall_like_a_cosine():
     config = replace(PLAIN, updates=110, warmup_updates=10, final_lr_share=0.2)
     assert config.lr_share(9) == config.lr_share(10) == 1.0
-    assert config.lr_share(60) == pytest.approx(0.6)  # half way
     assert config.lr_share(35) == pytest.approx(0.2 + 0.8 * 0.5 * (1 + math.cos(math.pi / 4)))
     assert config.lr_share(110) == config.lr_share(500) == pytest.approx(0.2)
 
@@ -190,27 +178,21 @@ def nonfinite(seed: int = 0) -> list[Segment]:
     return segments
 
 
-def test_a_loss_that_is_not_finite_is_skipped_and_counted():
+@pytest.mark.parametrize("of", ["loss", "gradient"])
+def test_a_step_that_is_not_finite_is_skipped_and_counted(of: str):
     update = make_update()
-    before = update.adapter.copy()
-    metrics = update.step(nonfinite())
-    assert metrics["skipped"] == 1 and not math.isfinite(metrics["loss"])
-    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy().items())
-    assert update.version == 1
+    before = update.adapter.copy_weights()
+    hook = update.adapter.weight.register_hook(lambda g: g * math.inf if of == "gradient" else g)
+    metrics = update.step(nonfinite() if of == "loss" else make_segments(LENGTHS))
+    assert metrics["skipped"] == update.version == 1
+    assert math.isfinite(metrics["loss"]) is (of == "gradient")
+    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy_weights().items())
+    hook.remove()
     metrics = update.step(make_segments(LENGTHS))
     assert metrics["skipped"] == metrics["lag_mean"] == metrics["lag_max"] == 1
-    after = update.adapter.copy()
+    after = update.adapter.copy_weights()
     assert all(torch.isfinite(p).all() for p in after.values())
     assert not torch.equal(after["policy.weight"], before["policy.weight"])
-
-
-def test_a_gradient_that_is_not_finite_is_skipped_even_if_the_loss_is():
-    update = make_update()
-    before = update.adapter.copy()
-    update.adapter.weight.register_hook(lambda gradient: gradient * float("inf"))
-    metrics = update.step(make_segments(LENGTHS))
-    assert math.isfinite(metrics["loss"]) and metrics["skipped"] == 1
-    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy().items())
 
 
 def test_so_many_in_a_row_are_an_error_and_a_finite_one_between_starts_the_count_again():
@@ -222,7 +204,7 @@ def test_so_many_in_a_row_are_an_error_and_a_finite_one_between_starts_the_count
         update.step(nonfinite())
     with pytest.raises(NonFiniteError, match="5 steps in a row"):
         update.step(nonfinite())
-    assert update.skipped == 2 * MAX_NONFINITE - 1
+    assert update.skipped == 2 * (MAX_NONFINITE - 1)
 
 
 def test_the_memory_of_advantages_by_hand():
@@ -241,7 +223,7 @@ def test_the_memory_of_advantages_by_hand():
 PROBED = TrainerConfig(
     updates=100, lr=5e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, probe_every=3
 )
-NAMES = ["logprob/mismatch_mean", "logprob/mismatch_max", "logprob/mismatch_clip"]
+NAMES = ["logprob/mismatch_mean", "logprob/mismatch_max"]
 
 
 def fresh(update: RatioUpdate, seed: int = 0) -> list[Segment]:
@@ -250,10 +232,8 @@ def fresh(update: RatioUpdate, seed: int = 0) -> list[Segment]:
 
 
 def read(metrics: dict[str, float]) -> list[float] | None:
-    """Mean, maximum and clipped share, if there is a reading."""
-    found = [metrics[name] for name in NAMES if name in metrics]
-    assert len(found) in (0, 3)
-    return found or None
+    """Mean and maximum, if there is a reading."""
+    return [metrics[name] for name in NAMES if name in metrics] or None
 
 
 def readings(update: RatioUpdate, updates: int) -> list[int]:
@@ -274,25 +254,14 @@ def shifted(segments: list[Segment], by: float) -> list[Segment]:
     return segments
 
 
-@pytest.mark.parametrize(
-    ("by", "clipped"), [(0.15, 0.0), (-0.15, 0.0), (0.19, 1.0), (-0.22, 0.0), (-0.23, 1.0), (3.0, 1.0)]
-)
-def test_a_planted_mismatch_is_found(by: float, clipped: float):
-    """The whole decision's ratio, though the algorithm has one for each factor: exp(0.19) is outside 1 ± 0.2,
-    exp(−0.22) is not."""
-    update = make_update(PROBED)
-    found = read(update.step(shifted(fresh(update), by)))
-    assert found == pytest.approx([abs(by), abs(by), clipped], abs=1e-4)
-
-
-def test_mean_maximum_and_share_are_of_decisions():
+def test_a_planted_mismatch_is_found():
     """5 decisions of 13 are off by 0.5 and 4 by −0.1, which do not cancel."""
     update = make_update(PROBED)
     segments = fresh(update)
     shifted(segments[1:2], 0.5)
     shifted(segments[3:], -0.1)
     found = read(update.step(segments))
-    assert found == pytest.approx([(5 * 0.5 + 4 * 0.1) / 13, 0.5, 5 / 13], abs=1e-4)
+    assert found == pytest.approx([(5 * 0.5 + 4 * 0.1) / 13, 0.5], abs=1e-4)
 
 
 @pytest.mark.parametrize("micro_batch", [1, 4, 1000])
@@ -303,7 +272,7 @@ def test_only_decisions_of_the_probed_version_count(micro_batch: int):
     segments[1].log_prob[2:] += 7.0
     segments[2].version[:] = 5
     segments[2].log_prob[:] = 100.0
-    assert read(update.step(segments)) == pytest.approx([0.1, 0.1, 0.0], abs=1e-4)
+    assert read(update.step(segments)) == pytest.approx([0.1, 0.1], abs=1e-4)
 
 
 def test_decisions_are_scored_under_the_weights_that_made_them():
@@ -313,7 +282,7 @@ def test_decisions_are_scored_under_the_weights_that_made_them():
     for i in range(4):
         assert read(update.step(decided_by(update.adapter, make_segments(LENGTHS, seed=i), -1))) is None
     metrics = update.step(late)
-    assert read(metrics) == pytest.approx([0.1, 0.1, 0.0], abs=1e-4)
+    assert read(metrics) == pytest.approx([0.1, 0.1], abs=1e-4)
     assert metrics["ratio_max_dev"] > 0.3
 
 
@@ -332,7 +301,7 @@ def test_factors_that_a_latent_does_not_have_are_left_out():
     for segment in segments:
         segment.log_prob[:, 0] -= 0.1
         segment.log_prob[:, 1] = math.nan
-    assert read(update.step(segments)) == pytest.approx([0.1, 0.1, 0.0], abs=1e-4)
+    assert read(update.step(segments)) == pytest.approx([0.1, 0.1], abs=1e-4)
 
 
 def test_measuring_changes_nothing_that_is_learnt():
@@ -341,7 +310,9 @@ def test_measuring_changes_nothing_that_is_learnt():
         metrics = with_.step(fresh(with_, i))
         expected = without.step(fresh(without, i))
         assert {k: v for k, v in metrics.items() if k not in NAMES} == expected
-    assert all(torch.equal(p, without.adapter.copy()[k]) for k, p in with_.adapter.copy().items())
+    assert all(
+        torch.equal(p, without.adapter.copy_weights()[k]) for k, p in with_.adapter.copy_weights().items()
+    )
 
 
 def test_the_live_weights_are_back_in_their_own_memory_whatever_happens(monkeypatch: pytest.MonkeyPatch):
@@ -349,7 +320,7 @@ def test_the_live_weights_are_back_in_their_own_memory_whatever_happens(monkeypa
     probe = Probe(adapter, PROBED)
     with torch.no_grad():
         adapter.weight.add_(0.3)
-    before, place = adapter.copy(), adapter.weight.data_ptr()
+    before, place = adapter.copy_weights(), adapter.weight.data_ptr()
 
     def evaluate(*_: Any) -> None:
         assert not torch.equal(adapter.weight, before["policy.weight"])
@@ -370,4 +341,4 @@ def test_a_version_that_never_acted_is_given_up_for_the_newest():
     assert read(update.step(later[0])) is None and update._probe._version == 0
     later[1][1].version[:] = 1  # now most of the batch is newer than version 0
     assert read(update.step(later[1])) is None and update._probe._version == 2
-    assert read(update.step(fresh(update))) == pytest.approx([0.0] * 3, abs=1e-4)
+    assert read(update.step(fresh(update))) == pytest.approx([0.0] * 2, abs=1e-4)

@@ -44,6 +44,7 @@ class Case(NamedTuple):
 
 CASES = {kind: Case(kind) for kind in POLICIES} | {
     "smolvla, zero2": Case("smolvla", {"ranks": 2, "sharding": "zero2"}),
+    "smolvla, recomputed": Case("smolvla", SHARDED | {"activation_checkpointing": True}),
     "smolvla, lora": Case("smolvla", options={"tuning": TuningConfig(mode="lora", rank=2)}),
     "smolvla_bins": Case("smolvla_bins", options={"discover_packages_path": "lerobot_policy_smolvla_bins"}),
 }

@@ -9,13 +9,13 @@ import pytest
 
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engines import Progress, local
+from accerl_lerobot.engines import local
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from benchmarks import study
 from benchmarks.study import BenchStudyConfig, HeldBackEngine, bench_study
-from tests.runs import drive, tiny_run, until
+from tests.runs import drive, tiny_run, until, updates
 
 
 @pytest.mark.parametrize(
@@ -41,9 +41,6 @@ def test_weights_held_back_act_so_many_updates_late_and_a_run_resumes(tiny_check
         engine = HeldBackEngine(hold_back, config, ("match",), state=state)
         engine.train()
         return engine
-
-    def updates(history: list[Progress]) -> list[dict[str, float]]:
-        return [update for progress in history for update in progress.updates]
 
     late = drive(begin(4))
     lags = [update["lag_mean"] for update in updates(late)]

@@ -124,7 +124,8 @@ def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path, monkeypat
     with pytest.raises(SystemExit):
         run(monkeypatch, lambda: LeRobotDataset("a/b", root=root), *arguments)
     answer = json.loads(capsys.readouterr().out.rpartition(ANSWER)[2])
-    assert answer["field"] == "dataset.root" and "is no template of a file" in answer["why"]
+    field, _, hint = answer["refused"]
+    assert field == "dataset.root" and "is no template of a file" in hint
 
 
 def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

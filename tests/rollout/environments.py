@@ -6,8 +6,14 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.envs import ChunkResult, Environment, EnvironmentSpec
-from accerl_lerobot.experience import TASK, Decision, Observation, Request, Segment
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
+from accerl_lerobot.experience import TASK, Decision, Observation, Request
+from accerl_lerobot.rollout.runner import (
+    EpisodePlan,
+    EpisodePlans,
+    EpisodeResult,
+    RolloutConfig,
+    RolloutRunner,
+)
 
 CHUNK = 2
 CAMERA = "observation.images.front"
@@ -81,28 +87,15 @@ def decide(request: Request, version: int = 0) -> Decision:
 
 
 class Recorder:
-    """A runner whose plans, segments and results are at hand.
-
-    Args:
-        environments: one per slot.
-        plans: handed out in order, then None.
-        config: of the runner.
-    """
+    """A runner of these environments, one per slot, whose plans, segments and results are at hand."""
 
     def __init__(
-        self,
-        environments: list[Environment],
-        plans: list[EpisodePlan],
-        config: RolloutConfig,
-        name: str = "r0.0",
+        self, environments: list[Environment], plans: list[EpisodePlan], config: RolloutConfig
     ) -> None:
-        self.plans = list(plans)
-        self.segments: list[Segment] = []
-        self.results: list[EpisodeResult] = []
-        self.runner = RolloutRunner(
-            environments, lambda source: self.plans.pop(0) if self.plans else None, config, name,
-            self.segments.append, self.results.append,
-        )  # fmt: skip
+        self.plans = EpisodePlans(("push", "pull"), 0, None)
+        self.plans.queue(plans)
+        self.runner = RolloutRunner(environments, self.plans, config)
+        self.segments, self.results = self.runner.segments, self.runner.results
 
     def play(self, version: int = 0) -> list[list[Request]]:
         """Runs all plans, slot by slot in turn; the requests each slot made."""

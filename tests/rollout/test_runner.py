@@ -2,6 +2,7 @@
 """Environments between decisions: what becomes a segment, what becomes a result."""
 
 import pickle
+from collections import deque
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
-from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.experience import REAL, Decision, Request
 from accerl_lerobot.rollout.runner import (
     EpisodePlan,
     EpisodePlans,
@@ -108,20 +109,19 @@ def test_a_nan_is_counted_and_the_next_episode_goes_on(nan_in: str):
     # Decisions 1 to 3 had become a segment; the 4th and 5th had not when the 5th met the NaN.
     assert [len(s) for s in recorder.segments] == [3]
     assert recorder.runner.counters.dropped_nonfinite == 2
-    assert recorder.results == [] and recorder.runner.counters.episodes == 0
+    assert not recorder.results and recorder.runner.counters.episodes == 0
     environments[0].nan_at = 0
-    recorder.plans = [explore(2)]
+    recorder.plans.queue([explore(2)])
     recorder.play()
     assert len(recorder.results) == 1 and recorder.results[0].plan.seed == 2
-    seeds = {s.observations["observation.state"][0, 0] for s in recorder.segments[1:]}
+    seeds = {s.observations["observation.state"][0, 0] for s in list(recorder.segments)[1:]}
     assert seeds == {2.0}, "nothing of the dropped episode may follow"
 
 
 def test_an_evaluation_that_meets_a_nan_still_has_a_result():
     recorder = played(evaluate(1, 0), evaluate(2, 1), steps=20, nan_at=5)
     assert [(r.plan.index, r.success) for r in recorder.results] == [(0, False), (1, False)]
-    assert recorder.segments == []
-
+    assert not recorder.segments
     assert all(r.note == "an episode is dropped: the reward is not finite" for r in recorder.results)
     assert recorder.runner.counters.dropped_episodes == 2
     assert summarise(recorder.results)["notes"] == [f"2 of 2 episodes: {recorder.results[0].note}"]
@@ -205,7 +205,8 @@ def make(worker: int = 0, incarnation: int = 0, budget: int | None = None) -> Ep
 
 
 def take(plans: EpisodePlans, count: int) -> list[EpisodePlan]:
-    found = [plans.next(exploring=True) for _ in range(count)]
+    plans.exploring = True
+    found = [plans.next(REAL, deque()) for _ in range(count)]
     return [plan for plan in found if plan is not None]
 
 
@@ -234,8 +235,8 @@ def test_evaluations_go_first_and_nothing_is_explored_before_it_is_time():
     plans = make()
     plans.queue([evaluate(index=0), evaluate(index=1)])
     assert [p.index for p in take(plans, 1)] == [0]
-    assert plans.next(exploring=False) == evaluate(index=1)
-    assert plans.next(exploring=False) is None
+    plans.exploring = False
+    assert [plans.next(REAL, deque()) for _ in range(2)] == [evaluate(index=1), None]
     assert take(plans, 1)[0].explore
 
 
@@ -257,7 +258,7 @@ def test_no_more_episodes_than_were_paid_for():
     plans = make(budget=4)
     assert not plans.spent and len(take(plans, 9)) == 4 and plans.spent
     plans.queue([evaluate(index=0)])
-    assert plans.next(exploring=True) == evaluate(index=0), "evaluations are not counted"
+    assert take(plans, 2) == [evaluate(index=0)], "evaluations are not counted"
     endless = make()
     assert len(take(endless, 9)) == 9 and not endless.spent
 
