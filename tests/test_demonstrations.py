@@ -125,7 +125,7 @@ def test_the_memory_begins_with_them_and_is_restored_without(
     dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
 ):
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-    adapter = with_teacher(load_adapter, SimulatorStateConfig(), STATE_SIZE, 0.5, policy)
+    adapter = with_teacher(load_adapter, SimulatorStateConfig(), STATE_SIZE, policy)
     adapter.demonstrations = partial(demonstrations, dataset, COST)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)

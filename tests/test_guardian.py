@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever ends a process, nothing that it has started is left; signals are noted, or heeded at once."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -11,9 +12,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from accerl_lerobot.demos.record import simulators
+from accerl_lerobot.demos.record import simulated
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, handled
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs.base import Environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.run.resuming import continued
@@ -69,14 +72,19 @@ def test_nothing_is_left_however_a_process_ends(how: str, tmp_path: Path):
     assert eventually(lambda: not Path(f"/dev/shm/sem.{semaphore.strip('/')}").exists())
 
 
+def play(environment: Environment, seconds: int) -> bool:
+    time.sleep(seconds)
+    return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
 def test_simulators_end_at_once_when_their_parent_is_interrupted():
     """They leave the signal to it."""
-    with pytest.raises(KeyboardInterrupt), simulators(1, int) as pool:
-        assert pool.submit(signal.getsignal, signal.SIGINT).result() is signal.SIG_IGN
-        late = pool.submit(time.sleep, 3600)
-        assert eventually(late.running)
+    before = set(multiprocessing.active_children())
+    with pytest.raises(KeyboardInterrupt), simulated(SimulatedConfig(), play, [0, 3600]) as results:
+        assert next(results)
+        assert set(multiprocessing.active_children()) - before
         raise KeyboardInterrupt
-    assert late.done()
+    assert eventually(lambda: not set(multiprocessing.active_children()) - before)
 
 
 def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():

@@ -205,16 +205,6 @@ READ = {FRONT: {"type": "VISUAL", "shape": [3, 32, 32]}, STATE: {"type": "STATE"
 
 
 @pytest.mark.parametrize(
-    ("features", "without", "policy", "why"),
-    [
-        ({"observation.state.joints": VECTOR}, STATE, {}, r"it is in parts \(observation.state.joints\)"),
-        ({"action.pose": VECTOR}, "action", {}, r"no action for a policy: .* parts \(action.pose\); join"),
-        ({}, "action", {}, "no action, so that there is nothing to imitate"),
-        ({"observation.images.top": IMAGE}, "", {}, "no observation.images.top in the env.*name fewer in"),
-        ({"observation.images.top": IMAGE}, "", {"input_features": READ}, None),
-    ],
-)
-@pytest.mark.parametrize(
     ("field", "least", "name"), [("max_state_dim", 4, STATE), ("max_action_dim", 2, "action")]
 )
 def test_more_numbers_than_a_policy_pads_to_are_refused(field: str, least: int, name: str, tmp_path: Path):
@@ -231,6 +221,16 @@ def test_more_numbers_than_a_policy_pads_to_are_refused(field: str, least: int, 
         check(least - 1)
 
 
+@pytest.mark.parametrize(
+    ("features", "without", "policy", "why"),
+    [
+        ({"observation.state.joints": VECTOR}, STATE, {}, r"it is in parts \(observation.state.joints\)"),
+        ({"action.pose": VECTOR}, "action", {}, r"no action for a policy: .* parts \(action.pose\); join"),
+        ({}, "action", {}, "no action, so that there is nothing to imitate"),
+        ({"observation.images.top": IMAGE}, "", {}, "no observation.images.top in the env.*name fewer in"),
+        ({"observation.images.top": IMAGE}, "", {"input_features": READ}, None),
+    ],
+)
 def test_what_a_policy_reads_of_a_dataset_is_looked_at_before_any_work(
     features: dict[str, Any], without: str, policy: dict[str, Any], why: str | None, tmp_path: Path
 ):

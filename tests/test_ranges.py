@@ -29,7 +29,6 @@ from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.timeline import TimelineConfig
 from accerl_lerobot.world_model.config import PixelModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
@@ -87,7 +86,6 @@ RULES = [
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
     (PixelModelConfig, {"channels": ()}, "world_model.model.channels="),
-    (ReplayConfig, {"max_unlearned_decisions": 5000}, "replay.max_unlearned_decisions="),
     (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),

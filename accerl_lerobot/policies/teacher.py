@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from accerl_lerobot.world_model.states import StateModel, StateSpec
 
 WIDTH = 256
+SHARE = 0.5  # of exploring episodes, in which it acts once it is ready
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
 ENCODED = 64  # observations of which states are computed at once; images may be large
 TEACHER_PREFIX = "teacher."  # how names of its weights begin among those that are published
@@ -60,7 +61,7 @@ class Ensemble(nn.Module):
 
 
 class Teacher(nn.Module):
-    """Chunks from states; once `ready`, it acts in a `share` of exploring episodes.
+    """Chunks from states; once `ready`, it acts in part of the exploring episodes.
 
     A state consists of the output of ``model.encode`` and the code of the task.
 
@@ -68,12 +69,10 @@ class Teacher(nn.Module):
     no gradient reaches.
     """
 
-    def __init__(self, model: StateModel, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:
+    def __init__(self, model: StateModel, chunk: tuple[int, int]) -> None:
         super().__init__()
         self.model = model
         self.chunk = chunk
-        self.share = share
-        self.noise = noise
         state = model.size + TASK_BITS
         rows, action_dim = chunk
         self.network = Ensemble(state, rows * action_dim, 1)
@@ -120,7 +119,7 @@ class Teacher(nn.Module):
     def plays(self, episode: int) -> bool:
         """True if, once ready, it makes all decisions of this exploring episode; see `seeds.episode_of`."""
         generator = np.random.default_rng((episode, 4))
-        return generator.random() < self.share
+        return generator.random() < SHARE
 
     @torch.no_grad()
     def replace(self, chunk: Tensor, requests: Sequence[Request]) -> Tensor:
@@ -136,18 +135,11 @@ class Teacher(nn.Module):
         for row, request, actions in zip(rows, asked, taught, strict=True):
             generator = np.random.default_rng((request.noise_seed, 5))
             noise = torch.from_numpy(generator.standard_normal(self.chunk))
-            chunk[row] = actions + self.noise * noise.to(actions)
+            chunk[row] = actions + NOISE * noise.to(actions)
         return chunk
 
 
-def with_teacher(
-    load: Load,
-    model: StateModelConfig,
-    environment_state: int,
-    share: float,
-    config: PolicyConfig,
-    noise: float = NOISE,
-) -> Any:
+def with_teacher(load: Load, model: StateModelConfig, environment_state: int, config: PolicyConfig) -> Any:
     """Load a policy and give it an untrained teacher on states of an untrained `model`.
 
     `environment_state` is the number of numbers that the simulator tells; 0: it tells none.
@@ -158,7 +150,7 @@ def with_teacher(
     spec = state_spec(adapter.policy.config, config.rename_map, environment_state)
     zero, scale = adapter.processing.units(torch.zeros(1, spec.chunk[1]))
     spec = spec._replace(units=(zero[0].numpy(), scale[0].numpy()))
-    teacher = Teacher(new_state_model(spec, model), spec.chunk, share, noise)
+    teacher = Teacher(new_state_model(spec, model), spec.chunk)
     adapter.teacher = teacher.to(adapter.device)
     return adapter
 

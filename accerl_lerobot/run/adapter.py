@@ -53,8 +53,7 @@ def make_adapter(
     if isinstance(algorithm, ChunkCriticConfig):
         from accerl_lerobot.policies.teacher import with_teacher
 
-        share = algorithm.teacher_episodes
-        adapter: Any = with_teacher(loader(load), state_model, environment_state, share, policy)
+        adapter: Any = with_teacher(loader(load), state_model, environment_state, policy)
     else:
         adapter = loader(load)(policy)
     if remembered is not None:

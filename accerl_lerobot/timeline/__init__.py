@@ -4,7 +4,7 @@
 Entering a state ends the one before, so states exclude each other and their times add up to the time of the
 process by construction.
 
-``RUN/timeline/rollout 0.1.bin`` is the second process (1) of ``rollout 0``. Each `ENTRY` has a time and the
+``RUN/timeline/rollout 0.1.states`` is the second process (1) of ``rollout 0``. Each `ENTRY` has a time and the
 state that begins then. A killed process leaves at worst half an entry, which is not read. A process records
 its first 1.8 million entries.
 
@@ -40,7 +40,7 @@ ROLES = (
 )  # fmt: skip
 TIMELINE = "timeline"
 TRACE = "timeline.json"
-SUFFIX = ".bin"
+SUFFIX = ".states"
 ENTRY = np.dtype([("ns", "<i8"), ("state", "u1")])
 """Nanoseconds of the calendar, and a number in `STATES`."""
 FLUSH_NS = 1_000_000_000

@@ -35,6 +35,7 @@ from accerl_lerobot.experience import (
     SegmentStart,
     stack_observations,
 )
+from accerl_lerobot.policies import teacher as teacher_module
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
@@ -97,7 +98,7 @@ def learner(
     """A learner on the state of a simulator that tells one number, or on the state of another `model`."""
     numbers, model = int(model is None), model or SimulatorStateConfig()
     policy = PolicyConfig(path=str(path), device="cpu")
-    adapter = with_teacher(load_adapter, model, numbers, 0.5, policy, noise=0.1)
+    adapter = with_teacher(load_adapter, model, numbers, policy)
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
     return ChunkCriticUpdate(adapter, algorithm or ChunkCriticConfig(), config)
 
@@ -183,7 +184,7 @@ def slowly(ensemble: Ensemble, member: int, x: np.ndarray) -> np.ndarray:
 
 def test_a_teacher_keeps_to_its_range():
     torch.manual_seed(0)
-    teacher = Teacher(simulator(2), chunk=(3, 2), share=1.0, noise=0.0)
+    teacher = Teacher(simulator(2), chunk=(3, 2))
     with torch.no_grad():
         teacher.low.copy_(torch.tensor([-1.0, 2.0]))
         teacher.high.copy_(torch.tensor([0.0, 4.0]))
@@ -197,18 +198,19 @@ def test_a_teacher_keeps_to_its_range():
 class TestActing:
     def test_buffers_of_the_world_model_are_published(self, tiny_checkpoint: Path):
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-        trained, replica = (
-            with_teacher(load_adapter, LatentConfig(latents=4), 0, 0.5, config) for _ in range(2)
-        )
+        trained, replica = (with_teacher(load_adapter, LatentConfig(latents=4), 0, config) for _ in range(2))
         for adapter, value in ((trained, 7), (replica, 0)):
             adapter.teacher.model.register_buffer("seen", torch.tensor(value))
         replica.load_trainable(trained.export_trainable())
         assert int(replica.teacher.model.seen) == 7
 
-    def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
+    def test_whole_episodes_are_the_teachers_once_it_is_ready(
+        self, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        monkeypatch.setattr(teacher_module, "NOISE", 0.0)
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
         model = SimulatorStateConfig()
-        adapter = with_teacher(load_adapter, model, STATE_SIZE, share=0.5, config=config, noise=0.0)
+        adapter = with_teacher(load_adapter, model, STATE_SIZE, config)
         assert adapter.teacher is not None
         observation = make_environment(ENV).reset(0, "match")
         asked = [
@@ -232,8 +234,9 @@ class TestActing:
             expected = wanted if acts.reshape(-1)[i] else before.chunk
             np.testing.assert_allclose(decision.chunk, expected, atol=1e-6)
 
-    def test_its_noise_belongs_to_the_request(self):
-        teacher = Teacher(simulator(STATE_SIZE), chunk=(4, 2), share=1.0, noise=0.5)
+    def test_its_noise_belongs_to_the_request(self, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr(teacher_module, "SHARE", 1.0)
+        teacher = Teacher(simulator(STATE_SIZE), chunk=(4, 2))
         with torch.no_grad():
             teacher.ready.fill_(1)
         observation = make_environment(ENV).reset(0, "match")
@@ -241,7 +244,7 @@ class TestActing:
         chunk = teacher.replace(torch.zeros(400, 4, 2), asked)
         torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
         noise = chunk - teacher(state_of(teacher, observation)).detach()
-        assert abs(float(noise.std()) - 0.5) < 0.03
+        assert abs(float(noise.std()) - teacher_module.NOISE) < 0.02
 
 
 def test_actions_are_normalised_as_they_are_unnormalised_and_constant_ones_are_0(tiny_checkpoint: Path):
@@ -375,6 +378,36 @@ def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest
     assert metrics["teacher_success"] == pytest.approx(1 / 3)
 
 
+def test_successes_are_imitated_until_the_teacher_succeeds_as_often(
+    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    update = learner(tiny_checkpoint, value_warmup_updates=9)
+    assert update.imitates_teacher, "of recorded episodes there are no outcomes to compare"
+    monkeypatch.setattr(update.teacher, "plays", lambda episode: episode == 1)
+
+    def explore(player: int, wins: int, losses: int) -> None:
+        rewards = [[0.0, 1.0]] * wins + [[0.0, 0.0]] * losses
+        segments = [episode(each, actions=np.full((2, 4, 2), each[-1], np.float32)) for each in rewards]
+        for segment in segments:
+            segment.origin = SegmentStart("match", player, 0)
+        update.step(segments)
+
+    explore(0, 2, 2)
+    with torch.no_grad():
+        update.teacher.ready.fill_(1)
+    explore(1, 9, 0)
+    assert not update.imitates_teacher, "nine episodes of the teacher say too little"
+    successes = np.flatnonzero(update.memory["success"])
+    assert update.imitable().tolist() == successes.tolist() and len(successes) == 22
+    assert_close(update.target(successes), update.memory["chunk"][successes])
+    explore(1, 1, 0)
+    rows = update.imitable()
+    assert rows.tolist() == list(range(28))
+    assert_close(update.target(rows), update.teacher(update.tensor("state", rows)))
+    explore(1, 0, 11)
+    assert not update.imitates_teacher, "10 of 21 are less than 2 of 4"
+
+
 def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
     update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
     before = update.adapter.export_trainable()
@@ -421,6 +454,7 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     """Reward is how far the first action goes up; the state says nothing. bf16 is emulated, and slow."""
     torch.manual_seed(0)
     monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
+    monkeypatch.setattr(ChunkCriticUpdate, "imitates_teacher", True)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 16)
     algorithm = ChunkCriticConfig(critic_steps=4.0, policy_steps=0.5)
     update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
