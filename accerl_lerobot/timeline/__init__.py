@@ -4,9 +4,9 @@
 Entering a state ends the one before, so states exclude each other and their times add up to the time of the
 process by construction.
 
-``RUN/timeline/rollout 0.1.states`` is the second process (1) of ``rollout 0``. Each `ENTRY` has a time and the
-state that begins then. A killed process leaves at worst half an entry, which is not read. A process records
-its first 1.8 million entries.
+``RUN/timeline/rollout 0.1.states`` is the second process (1) of ``rollout 0``. Each `ENTRY` has a time and
+the state that begins then. A killed process leaves at worst half an entry, which is not read. A process
+records its first 1.8 million entries.
 
 The result is a Chrome trace, which https://ui.perfetto.dev shows, and the shares of each role's time.
 """
