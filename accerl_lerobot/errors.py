@@ -110,7 +110,9 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
-    while error is not None:
+    known: list[BaseException] = []
+    while error is not None and error not in known:
+        known.append(error)
         yield error
         error = error.__cause__ or error.__context__
 

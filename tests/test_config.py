@@ -153,7 +153,10 @@ def test_a_recipe_says_how_it_differs_from_its_base(recipe: str, tmp_path: Path)
     assert config.algorithm == PPOConfig(gamma=0.8)
     assert parse(DemosRun, [str(top)], recipe_class=RunConfig).env == config.env
     top.write_text("base: nowhere")
-    with pytest.raises(InputError, match="config_path='nowhere': no such file"):
+    with pytest.raises(InputError, match="^base='nowhere': no such file"):
+        parse(RunConfig, [str(top)])
+    top.write_text(f"base: {top}")
+    with pytest.raises(InputError, match="^base=.*top.yaml': this recipe is laid on itself"):
         parse(RunConfig, [str(top)])
     middle.write_text("policy: {trust_remote_code: abc}")
     top.write_text(f"base: {middle}")

@@ -17,6 +17,7 @@ from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, handled
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.envs.base import Environment
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.run.resuming import continued
 from tests.runs import eventually
@@ -118,6 +119,10 @@ def test_handlers_of_a_library_that_starts_are_taken_back():
 
 def test_low_rank_adapters_need_the_policy_that_they_adapt(tmp_path: Path):
     checkpoint = tmp_path / "checkpoints" / "000001"
+    tuning = TuningConfig(mode="lora")
     for path in (str(tmp_path), "alice/start"):
-        config = RunConfig(policy=PolicyConfig(path=path, tuning=TuningConfig(mode="lora")))
+        config = RunConfig(policy=PolicyConfig(path=path, tuning=tuning))
         assert continued(config, tmp_path, checkpoint).policy.path == path
+    config = RunConfig(policy=PolicyConfig(path=str(tmp_path / "gone"), tuning=tuning))
+    with pytest.raises(InputError, match=r"^policy\.path=.*gone': the policy that this run began from"):
+        continued(config, tmp_path, checkpoint)

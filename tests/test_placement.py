@@ -94,6 +94,11 @@ def test_a_resource_that_is_not_there_is_refused_with_those_that_are():
         Placement(run(rollout="simulators"), cluster((8, 0), (8, 0), n1="sim"))
 
 
+def test_cuda_is_not_looked_for_on_nodes_without():
+    with pytest.raises(InputError, match=r"policy\.device='cuda': there is no GPU on the nodes with sim"):
+        Placement(run(device="cuda", inference="sim"), cluster((8, 1), (8, 0), n1="sim"))
+
+
 @pytest.mark.parametrize(
     ("fields", "match"),
     [

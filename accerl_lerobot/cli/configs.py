@@ -35,13 +35,20 @@ class DemosRun(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class NewFolderRun(Section):
-    """Fields of verbs that compute something into a new folder."""
+    """Fields of verbs that compute something from a dataset into a new folder."""
 
     seed: Seed = 0
     output_dir: str | None = None
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str
     """Last part of the folder's name."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dataset.repo_id is None:
+            hint = "name a LeRobotDataset, on the Hub or with dataset.root"
+            raise InputError("dataset.repo_id", None, hint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +60,10 @@ class SFTRun(NewFolderRun):
     """cpu, cuda, or auto."""
     env: EnvConfig | None = None
     """When given, the dataset is checked against it first."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
     sft: SFTConfig = field(default_factory=SFTConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.dataset.repo_id is None:
-            hint = "name a LeRobotDataset, on the Hub or with dataset.root"
-            raise InputError("dataset.repo_id", None, hint)
         if self.sft.steps == 0:
             raise InputError("sft.steps", 0, "use at least 1")
 

@@ -81,6 +81,10 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     cost = _decision_cost(run)
     with closing(make_environment(config.env)) as environment:
         spec = environment.spec
+    for parts in episodes:
+        task = parts[0].origin.task
+        if task not in spec.tasks:
+            raise InputError("env.task", task, f"{EPISODES} has this task, and env has {spec.tasks}")
     record.check_instruction(spec, config.env)
     tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}

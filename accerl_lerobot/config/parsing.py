@@ -137,13 +137,24 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     return decode(config_class, merged)
 
 
-def _on_its_base(tree: dict[str, Any], config_class: type[Any]) -> dict[str, Any]:
-    """A recipe with what it does not say taken from the recipe that its key `BASE` names, if it has one."""
+def _on_its_base(
+    tree: dict[str, Any], config_class: type[Any], above: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """A recipe with what it does not say taken from the recipe that its key `BASE` names, if it has one.
+
+    `above` are the recipes that are laid on this one.
+    """
     if BASE not in tree:
         return tree
     over = dict(tree)
-    base = expanded(str(over.pop(BASE)), BASE)
-    return _overridden(config_class, _on_its_base(read_recipe(base), config_class), over)
+    base = str(over.pop(BASE))
+    if base in above:
+        raise InputError(BASE, base, "this recipe is laid on itself; leave the line out")
+    try:
+        below = read_recipe(expanded(base, BASE))
+    except InputError as error:
+        raise InputError(BASE, base, error.hint) from error
+    return _overridden(config_class, _on_its_base(below, config_class, (*above, base)), over)
 
 
 def _for_verb(tree: dict[str, Any], config_class: type[Any], recipe_class: type[Any]) -> dict[str, Any]:

@@ -253,6 +253,9 @@ class Placement:
         for selector in {self._selectors.get(role) for role in on_gpu}:
             roles = [role for role in on_gpu if self._selectors.get(role) == selector]
             gpus = sum(node.get("GPU", 0.0) for node in self._nodes_of(roles[0]))
+            if not gpus and config.policy.device.startswith("cuda") and selector is not None:
+                hint = f"there is no GPU on the nodes with {selector}; use auto, cpu or other nodes"
+                raise InputError("policy.device", config.policy.device, hint)
             others = sum(self._workers[role] for role in roles if role != "trainer")
             share = 1 / math.ceil(others / gpus) if gpus and others else 0.0
             of_trainer = 0.0

@@ -12,7 +12,6 @@ import contextlib
 import logging
 import math
 import time
-from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -137,9 +136,9 @@ class RestartedWorker(Worker):
     def is_starting(self) -> bool:
         return self._starting is not None
 
-    @abstractmethod
     def begin(self) -> None:
         """Start the long call of a process that is ready."""
+        raise NotImplementedError
 
     def started(self, reference: Any) -> None:
         """Note the long call of a process."""

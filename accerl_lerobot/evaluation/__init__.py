@@ -262,8 +262,8 @@ def _with_outcome(result: EpisodeResult) -> list[np.ndarray]:
 
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
-    """Pictures beside (axis 1) or below (axis 0) each other, with a white margin behind each."""
+    """Pictures beside (axis 1) or below (axis 0) each other, with a white margin between them."""
     margin = [(0, 0), (0, 0), (0, 0)]
     margin[axis] = (0, GAP)
-    parts = [np.pad(picture, margin, constant_values=255) for picture in pictures]
-    return np.concatenate(parts, axis=axis)
+    parts = [np.pad(picture, margin, constant_values=255) for picture in pictures[:-1]]
+    return np.concatenate([*parts, pictures[-1]], axis=axis)

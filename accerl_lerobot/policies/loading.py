@@ -116,7 +116,8 @@ def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device(name)
-    count = torch.cuda.device_count()
+    # There may be a GPU that torch cannot use.
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if device.type == "cuda" and (device.index or 0) >= count:
         here = f"there are {count} such devices here, numbered from 0" if count else "no CUDA device here"
         raise InputError(field, name, f"{here}; use cpu or auto")

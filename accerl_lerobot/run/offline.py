@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, OffPolicyConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.console import Console
@@ -152,11 +152,14 @@ def _remember(
     most = max(1, min(algorithm.memory, BYTES // size))
     longest = int(max(meta.episodes["length"]))
     outcomes: dict[int, bool] = {}  # episode → success
+    totals: dict[int, float] = {}  # episode → reward of its first segment
     with console.stage("reading the dataset", total=meta.total_frames) as stage:
         frames = 0
         for segment in recorded(config.dataset, meta, shapes, chunk, most, most, longest):
             update.remember(segment)
-            outcomes[segment.origin.seed] = segment.success
+            episode = segment.origin.seed
+            outcomes[episode] = segment.success
+            totals.setdefault(episode, float(segment.reward.sum()))
             frames += int(segment.steps.sum())
             stage.update(frames)
     if len(outcomes) < meta.total_episodes:
@@ -164,9 +167,9 @@ def _remember(
         logger.warning("%s, the others are left out", left)
     successes = sum(outcomes.values())
     counts = {"episodes": len(outcomes), "successes": successes, "decisions": len(update.memory)}
-    imitates_failures = isinstance(algorithm, AWRConfig)  # where they went better than expected
-    if not successes and not imitates_failures:
-        hint = "none of its episodes is a success; there is nothing to imitate"
+    graded = len(set(totals.values())) > 1 and not isinstance(algorithm, ChunkCriticConfig)
+    if not len(update.imitable()) or not (successes or graded):
+        hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     if isinstance(algorithm, ChunkCriticConfig) and update.state_learner is not None:
         transitions = len(update.transitions())

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import logging
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -25,7 +26,7 @@ from accerl_lerobot.demos import record
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, WrappedEnvironment
-from accerl_lerobot.experience import Observation, Request
+from accerl_lerobot.experience import Observation, Request, nonfinite
 from accerl_lerobot.policies.config import Load, executed_rows, loader
 from accerl_lerobot.run.preflight import policy_to_be
 from accerl_lerobot.seeds import noise_seed, train_seed
@@ -34,6 +35,8 @@ from accerl_lerobot.world_model.pretrain import pretrain, show
 
 if TYPE_CHECKING:
     from accerl_lerobot.policies.adapter import PolicyAdapter
+
+logger = logging.getLogger(__name__)
 
 PLAY, PRETRAINING = "play", "pretraining"  # folders of a run: recorded episodes, and their world model
 DISTURBED = record.DemosConfig(failure_share=0.1, action_noise=0.2, push=2.0)
@@ -116,7 +119,12 @@ def policy_play(
         seed = train_seed(config.seed, PLAY_WORKER, number)
         task = tasks[number % len(tasks)]
         actions = explored(adapter, environment, task, seed)
-        yield record.played(environment, task, seed, actions)
+        episode = record.played(environment, task, seed, actions)
+        bad = nonfinite(environment.seen | episode.observations | {"the reward": episode.rewards})
+        if bad:
+            logger.warning("an episode of play is dropped: %s is not finite", bad)
+        else:
+            yield episode
 
 
 def explored(
@@ -126,6 +134,8 @@ def explored(
     spec = environment.spec
     steps = 0
     for number in itertools.count():
+        if number and nonfinite(environment.seen):
+            return
         request = Request(
             observation=environment.seen,
             noise_seed=noise_seed(seed, number),

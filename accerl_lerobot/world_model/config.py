@@ -124,6 +124,11 @@ class WorldModelConfig(Section, section="world_model"):
     chunk: Annotated[int, Range("[1, 10000]")] = 10
     """Env steps per prediction: the actions a policy executes per decision."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.image_size % 2:
+            raise InputError("world_model.image_size", self.image_size, "use an even number")
+
 
 @dataclass(frozen=True, kw_only=True)
 class OnlineLearnConfig(Section, section="imagination.learn"):

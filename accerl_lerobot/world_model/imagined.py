@@ -39,6 +39,7 @@ from accerl_lerobot.policies.config import executed_rows
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.untrusted import refusing
 from accerl_lerobot.rollout.runner import Starts, start_of
+from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
     Episode,
@@ -169,6 +170,7 @@ class ImaginedEnvironment(Environment):
         self._world = world
         self._starts = starts
         self._task = ""
+        self._seed = 0
         self._steps = 0
         self._state: State = {}
 
@@ -177,13 +179,17 @@ class ImaginedEnvironment(Environment):
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         [frames], [robot] = model_arrays(arrays, self._world.model.spec)
         self._task = str(first[TASK])
+        self._seed = seed
         self._steps = 0
         self._state = self._world.begin(frames, robot, self._task)
         return self._observation(frames, robot)
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         actions = checked_actions(actions, self.spec)
-        prediction = self._world.step(self._state, actions)
+        # Equal episodes in any process, although a model may draw from the global generator.
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(noise_seed(self._seed, self._steps) % 2**63)
+            prediction = self._world.step(self._state, actions)
         self._state = prediction.state
         frames = prediction.frames[0].numpy()
         success = self._world.succeeds(frames, self._task)
@@ -202,7 +208,7 @@ class ImaginedEnvironment(Environment):
         raise NotImplementedError("imagined episodes are not filmed")
 
     def state(self) -> Any:
-        return {name: getattr(self, name) for name in ("_task", "_steps", "_state")}
+        return {name: getattr(self, name) for name in ("_task", "_seed", "_steps", "_state")}
 
     def restore(self, state: Any) -> None:
         vars(self).update(state)

@@ -42,6 +42,7 @@ HIDDEN = 128  # width of hidden layers
 PLANES = 8  # channels of the planes that tell the actions
 GRID = 4  # side of the success model's last feature map
 NOISE = 0.06  # largest std of the noise on frames in the success model's training, in units of [−1, 1]
+AT_ONCE = 256  # frames whose outcomes are predicted together
 LIGHT = 0.1  # standard deviation of their brightness
 
 
@@ -106,7 +107,8 @@ class PixelWorldModel(LearnableWorldModel):
             motion = (windows.robot[:, r] - state["robot"][:, -1] - self.motion_mean) / self.motion_std
             error = self._motion(state, numbers) - motion
             motions.append(error.square().sum(1) / max(1, motion.shape[1]))
-            state = self._predict(state, actions, executed).state
+            if r + 1 < windows.steps.shape[1]:
+                state = self._predict(state, actions, executed).state
         weight = (windows.steps > 0).float()
         count = weight.sum().clamp(min=1)
         image = (torch.stack(images, 1) * weight).sum() / count
@@ -196,7 +198,11 @@ class SuccessModel(nn.Module):
     @torch.no_grad()
     def probabilities(self, frames: Tensor, codes: Tensor) -> Tensor:
         """float32 (N,), of frames uint8 (N, V, H, W, 3) and task codes (N, 16)."""
-        return torch.sigmoid(self(_to_floats(frames), codes))
+        logits = [
+            self(_to_floats(some), their_codes)
+            for some, their_codes in zip(frames.split(AT_ONCE), codes.split(AT_ONCE), strict=True)
+        ]
+        return torch.sigmoid(torch.cat(logits))
 
     def loss(self, frames: Tensor, codes: Tensor, success: Tensor) -> Tensor:
         """Cross-entropy on frames that are shifted, lit and noisy at random; success is bool (N,)."""

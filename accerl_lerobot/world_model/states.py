@@ -196,11 +196,17 @@ class StateLearner:
     def state(self) -> dict[str, Any]:
         """A copy of all that `restore` needs."""
         optimizer = optimizer_state(self.optimizer)
-        return {"count": self.count, "model": copied(self.model), "optimizer": optimizer}
+        return {
+            "count": self.count,
+            "skipped_in_a_row": self._skipped_in_a_row,
+            "model": copied(self.model),
+            "optimizer": optimizer,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resume from `state`."""
         self.count = state["count"]
+        self._skipped_in_a_row = state["skipped_in_a_row"]
         self.model.load_state_dict(state["model"])
         restore_optimizer(self.optimizer, state["optimizer"])
 

@@ -172,6 +172,7 @@ class Trainer:
             "learnt": list(self.serving.learnt),
             "played": list(self.played),
             "pending_steps": self.pending_steps,
+            "skipped_in_a_row": self._skipped_in_a_row,
             "optimizer": optimizer_state(self._optimizer),
             "labelled": self._labelled,
         }
@@ -184,6 +185,7 @@ class Trainer:
         self.serving.learnt = state["learnt"]
         self.played.extend(state["played"])
         self.pending_steps = state["pending_steps"]
+        self._skipped_in_a_row = state["skipped_in_a_row"]
         self._labelled = state["labelled"]
         restore_optimizer(self._optimizer, state["optimizer"])
 
@@ -294,17 +296,14 @@ class OnlineLearningWorker:
     def run(self) -> None:
         """Makes the steps that are due, until the process ends."""
         while True:
-            if self._trainer.pending_steps < 1 or not self._inbox.empty():
-                batch = self._inbox.get()
+            while self._trainer.pending_steps >= 1:
+                fault_point("learning.step")
                 with self._lock, self._clock.during(COMPUTE):
-                    for segment in batch:
-                        self._trainer.add(segment)
-                continue
-            fault_point("learning.step")
-            with self._lock, self._clock.during(COMPUTE):
-                self._trainer.step()
-            if self._trainer.pending_steps < 1:
-                self._publish()
+                    self._trainer.step()
+            self._publish()
+            self._take()
+            while not self._inbox.empty():
+                self._take()
 
     def metrics(self) -> dict[str, float]:
         """Counts; ``version`` is that of `weights`."""
@@ -320,6 +319,12 @@ class OnlineLearningWorker:
         with self._lock, self._clock.during(CHECKPOINT):
             snapshot.save(directory / TRAINING_STATE / ONLINE, self._trainer.state())
             save_online(directory, self._trainer)
+
+    def _take(self) -> None:
+        batch = self._inbox.get()
+        with self._lock, self._clock.during(COMPUTE):
+            for segment in batch:
+                self._trainer.add(segment)
 
     def _publish(self) -> None:
         serving = self._trainer.serving

@@ -106,14 +106,11 @@ def test_stock_lerobot_is_told_the_names_that_the_run_gave(tmp_path: Path):
 
 def test_a_validation_is_reported(tmp_path: Path):
     write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {}})
-    checks = {
-        "auroc": {"value": 0.97123, "above": 0.9, "holds": True},
-        "recall": {"value": 0.1, "holds": False},
-    }
-    write_json(tmp_path / "validation.json", {"passed": False, "checks": checks})
+    found = {"skill": 0.25, "sensitivity": 1.5, "auroc": 0.97123, "failed": ["skill"], "episodes": 40}
+    write_json(tmp_path / "validation.json", found)
     text = card_of(tmp_path / "world_model", "world model")
     assert "**It failed validation**" in text and "| auroc | 0.9712 | yes |" in text
-    assert "| recall | 0.1 | no |" in text
+    assert "| skill | 0.25 | no |" in text
 
 
 def test_the_users_own_card_is_left_alone(tmp_path: Path):
