@@ -143,7 +143,7 @@ def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
         newest_whole(tmp_path)
     manifest = json.loads((path / "manifest.json").read_text())
     (path / "manifest.json").write_text(json.dumps(manifest | {"format": 9}))
-    with pytest.raises(InputError, match="its format is 9, and this accerl reads 6"):
+    with pytest.raises(InputError, match="its format is 9, and this accerl reads 7"):
         newest_whole(tmp_path)
     manifest["files"]["../../outside"] = {"size": 1, "sha256": "0"}
     (path / "manifest.json").write_text(json.dumps(manifest))

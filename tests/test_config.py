@@ -270,10 +270,10 @@ def test_the_world_model_of_a_run_is_not_that_of_pixels(tmp_path: Path):
     assert decode(RunConfig, encode(run)) == run
     recipe = tmp_path / "config.yaml"
     recipe.write_text(yaml.safe_dump(encode(run)))
-    flags = [f"--config_path={recipe}", "--world_model.image_size=32"]
+    flags = [f"--config_path={recipe}", "--dataset.repo_id=a/b", "--world_model.image_size=32"]
     assert parse(WorldModelRun, flags, recipe_class=RunConfig).world_model.image_size == 32
     recipe.write_text("world_model: {image_size: 32}")
-    assert parse(WorldModelRun, flags[:1], recipe_class=RunConfig).world_model.image_size == 32
+    assert parse(WorldModelRun, flags[:2], recipe_class=RunConfig).world_model.image_size == 32
 
 
 def test_the_state_is_the_simulators_where_it_is_told():
