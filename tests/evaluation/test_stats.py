@@ -121,7 +121,7 @@ def test_before_beside_after_with_outcomes(tmp_path: Path) -> None:
     with av.open(tmp_path / "film.mp4") as file:
         film = np.stack([each.to_ndarray(format="rgb24").astype(int) for each in file.decode(video=0)])
     half = 2 * 64 + GAP
-    assert film.shape[1:3] == (half + GAP, 2 * half + 5 * GAP)
+    assert film.shape[1:3] == (half, 2 * half + 4 * GAP)
 
     def edge(frame: int, row: int, column: int) -> str:
         left = column % 2 * (64 + GAP) + column // 2 * (half + 4 * GAP)
