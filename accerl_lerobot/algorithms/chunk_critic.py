@@ -51,7 +51,6 @@ PERCEPTION = 0.5  # weight of reading the state off the policy's features
 TEACHER_LR = 3e-4
 READER_LR = 1e-3
 LAST = 50  # exploring episodes that ``teacher_success`` and ``policy_success`` are of
-LEAST_TAUGHT = 10  # exploring episodes of the teacher before the policy may imitate it
 FIRST_STEPS = 2000  # steps in which the teacher learns what was done before it may act
 MOST_FIRST = 5000  # most steps of the critic before the teacher's first along it
 MARGIN = 0.05  # share of the explored range of actions that the teacher may go beyond it
@@ -205,7 +204,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def _encode_memory(self) -> None:
         states = self.memory["state"]
         parts = math.ceil(len(states) / REENCODED_AT_ONCE)
-        for rows in np.array_split(self._rows(), parts):
+        for rows in np.array_split(np.arange(len(states)), parts):
             observations, tasks = self.memory.observations(rows)
             elapsed = self.memory["elapsed"][rows]
             computed = self.teacher.states(observations, tasks, elapsed)
@@ -230,31 +229,12 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         metrics |= mean(self._teacher_step(won) for _ in teacher_steps)
         return metrics | super().learn(new)
 
-    @property
-    def imitates_teacher(self) -> bool:
-        """False while the teacher succeeds less often than the policy, which imitates successes until then.
-
-        Where nobody explores, as on recorded episodes, there is nothing to compare.
-        """
-        teacher = self._outcomes["teacher_success"]
-        policy = self._outcomes["policy_success"]
-        if not policy:
-            return True
-        return len(teacher) >= LEAST_TAUGHT and np.mean(teacher) >= np.mean(policy)
-
-    def imitable(self) -> np.ndarray:
-        if self.imitates_teacher:  # it labels every observation
-            return self._rows()
-        return super().imitable()
+    def imitable(self) -> np.ndarray:  # the teacher labels every observation
+        return np.arange(len(self.memory))
 
     @torch.no_grad()
     def target(self, rows: np.ndarray) -> Tensor:
-        if self.imitates_teacher:
-            return self.teacher(self.tensor("state", rows))
-        return super().target(rows)
-
-    def _rows(self) -> np.ndarray:
-        return np.arange(len(self.memory))
+        return self.teacher(self.tensor("state", rows))
 
     def losses(self, rows: np.ndarray, encoded: Encoded | None, imitation: Tensor) -> dict[str, Tensor]:
         if encoded is None or self.reader is None:
@@ -309,7 +289,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self.teacher.high.copy_(high + margin)
         known = won
         if len(won) < BATCH:
-            known = self._rows()
+            known = np.arange(len(self.memory))
         for _ in range(FIRST_STEPS):
             loss = self._gap(drawn(known, BATCH)).square().mean()
             self._descend("teacher", loss)
@@ -325,7 +305,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def _critic_step(self, bounds: tuple[float, float]) -> Metrics:
         """One gradient step of the ensemble; ``bounds`` of the returns seen, which no target leaves."""
-        rows = drawn(self._rows(), BATCH)
+        rows = drawn(self.imitable(), BATCH)
         state = self.tensor("state", rows)
         chunk = self.tensor("chunk", rows)
         reward = self.tensor("reward", rows)
@@ -358,7 +338,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def _teacher_step(self, won: np.ndarray) -> Metrics:
         """One gradient step of the teacher; `won` are the rows of successful episodes."""
-        state = self.tensor("state", drawn(self._rows(), BATCH))
+        state = self.tensor("state", drawn(self.imitable(), BATCH))
         rows = drawn(won, BATCH)
         with self.adapter.autocast():
             q = self.critic(self.teacher.scaled(state), self.teacher(state))

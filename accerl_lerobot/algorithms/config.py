@@ -98,9 +98,8 @@ class ChunkCriticConfig(OffPolicyConfig):
     n is 4 decisions, m is ¼, s is the state of ``world_model.type``: the simulator's, which the policy never
     reads (asymmetric actor-critic, arXiv 1710.06542), or a latent one that is learned. The teacher μ is a
     small network of s, acts in half of the exploring episodes and labels every observation in memory (DAgger,
-    arXiv 1011.0686). While its last 50 exploring episodes succeed less often than the policy's, the policy
-    imitates successful episodes in its place. h is a linear map that exists only while training. Related:
-    TD3+BC (arXiv 2106.06860), RLPD (2302.02948), Q-chunking (2507.07969).
+    arXiv 1011.0686); h is a linear map that exists only while training. Related: TD3+BC (arXiv 2106.06860),
+    RLPD (2302.02948), Q-chunking (2507.07969).
     """
 
     update = "accerl_lerobot.algorithms.chunk_critic:ChunkCriticUpdate"

@@ -378,36 +378,6 @@ def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest
     assert metrics["teacher_success"] == pytest.approx(1 / 3)
 
 
-def test_successes_are_imitated_until_the_teacher_succeeds_as_often(
-    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    update = learner(tiny_checkpoint, value_warmup_updates=9)
-    assert update.imitates_teacher, "of recorded episodes there are no outcomes to compare"
-    monkeypatch.setattr(update.teacher, "plays", lambda episode: episode == 1)
-
-    def explore(player: int, wins: int, losses: int) -> None:
-        rewards = [[0.0, 1.0]] * wins + [[0.0, 0.0]] * losses
-        segments = [episode(each, actions=np.full((2, 4, 2), each[-1], np.float32)) for each in rewards]
-        for segment in segments:
-            segment.origin = SegmentStart("match", player, 0)
-        update.step(segments)
-
-    explore(0, 2, 2)
-    with torch.no_grad():
-        update.teacher.ready.fill_(1)
-    explore(1, 9, 0)
-    assert not update.imitates_teacher, "nine episodes of the teacher say too little"
-    successes = np.flatnonzero(update.memory["success"])
-    assert update.imitable().tolist() == successes.tolist() and len(successes) == 22
-    assert_close(update.target(successes), update.memory["chunk"][successes])
-    explore(1, 1, 0)
-    rows = update.imitable()
-    assert rows.tolist() == list(range(28))
-    assert_close(update.target(rows), update.teacher(update.tensor("state", rows)))
-    explore(1, 0, 11)
-    assert not update.imitates_teacher, "10 of 21 are less than 2 of 4"
-
-
 def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
     update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
     before = update.adapter.export_trainable()
@@ -454,7 +424,6 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     """Reward is how far the first action goes up; the state says nothing. bf16 is emulated, and slow."""
     torch.manual_seed(0)
     monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
-    monkeypatch.setattr(ChunkCriticUpdate, "imitates_teacher", True)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 16)
     algorithm = ChunkCriticConfig(critic_steps=4.0, policy_steps=0.5)
     update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
