@@ -278,7 +278,7 @@ class Simulator:
         mujoco.mj_camlight(self.model, self._seen)
 
     def _new_aim(self, action: np.ndarray) -> Aim:
-        """What the action adds to the hand's own pose; without a turn, the former rotation."""
+        """The pose that an action leads to from the hand's own; without a turn, the former rotation."""
         from robosuite.utils.control_utils import set_goal_orientation
 
         delta = self._robot.controller.scale_action(action[:6])

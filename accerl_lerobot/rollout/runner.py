@@ -131,10 +131,10 @@ class EpisodePlans:
         self._queued: deque[EpisodePlan] = deque()
         self._failing = dict.fromkeys(tasks, 1.0)
         # Episodes that each task is still to get. Each worker begins with another task; equals take turns.
-        self._owed: dict[str, float] = {}
+        self._due: dict[str, float] = {}
         for place, task in enumerate(tasks):
             turn = (place - worker) % len(tasks)
-            self._owed[task] = -1e-6 * turn
+            self._due[task] = -1e-6 * turn
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
@@ -157,9 +157,9 @@ class EpisodePlans:
         shares = {task: max(failing, LEAST_SHARE) for task, failing in self._failing.items()}
         total = sum(shares.values())
         for task, share in shares.items():
-            self._owed[task] += share / total
-        task = max(self._tasks, key=self._owed.__getitem__)
-        self._owed[task] -= 1
+            self._due[task] += share / total
+        task = max(self._tasks, key=self._due.__getitem__)
+        self._due[task] -= 1
         return EpisodePlan(task=task, seed=seed, explore=True)
 
     def _next_imagined(self, starts: Starts) -> EpisodePlan | None:
@@ -190,7 +190,7 @@ class EpisodePlans:
             "imagined": self.imagined,
             "queued": list(self._queued),
             "failing": dict(self._failing),
-            "owed": dict(self._owed),
+            "due": dict(self._due),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -199,7 +199,7 @@ class EpisodePlans:
         self.imagined = state["imagined"]
         self._queued.extend(state["queued"])
         self._failing = state["failing"]
-        self._owed = state["owed"]
+        self._due = state["due"]
 
 
 @kind

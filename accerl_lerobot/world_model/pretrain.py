@@ -83,7 +83,7 @@ def pretrain(
     with closing(make_environment(env)) as environment:
         spec = spec_of(environment.spec, config.image_size, config.chunk)
     torch.manual_seed(seed)
-    # The networks are initialised on the CPU, so alike on every device.
+    # The networks are initialised on the CPU, so that they are equal on every device.
     world = new_world(spec, config.model).to(torch_device)
     with console.stage("episodes"):
         episodes = load_episodes(dataset, spec)
