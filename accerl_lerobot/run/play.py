@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import gc
 import itertools
-import logging
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,18 +23,13 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
-from accerl_lerobot.envs.base import ChunkResult, WrappedEnvironment
-from accerl_lerobot.experience import Observation, Request, nonfinite
+from accerl_lerobot.envs.base import ChunkResult, Environment, WrappedEnvironment
+from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.config import Load, executed_rows, loader
+from accerl_lerobot.rollout.runner import EpisodePlans, RolloutRunner
 from accerl_lerobot.run.preflight import policy_to_be
-from accerl_lerobot.seeds import noise_seed, train_seed
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.pretrain import pretrain, show
-
-if TYPE_CHECKING:
-    from accerl_lerobot.policies.adapter import PolicyAdapter
-
-logger = logging.getLogger(__name__)
 
 PLAY, PRETRAINING = "play", "pretraining"  # folders of a run: recorded episodes, and their world model
 DISTURBED = record.DemosConfig(failure_share=0.1, action_noise=0.2, push=2.0)
@@ -78,70 +71,65 @@ def record_play(config: RunConfig, root: Path, console: Console, load: Load | No
     tally = {"episodes": 0, "frames": 0, "successes": 0}
     # Of other starts than the demonstrations.
     expert = partial(record.record_one, config.env, DISTURBED, config.seed + 1)
+    with closing(make_environment(config.env)) as environment:
+        spec = environment.spec
     with (
-        closing(WatchedEnvironment(make_environment(config.env))) as environment,
         console.stage("play", total=policy_episodes + expert_episodes) as stage,
         record.appearing(root) as folder,
-        record.new_dataset(folder, "accerl/play", environment.spec, config.env) as dataset,
+        record.new_dataset(folder, "accerl/play", spec, config.env) as dataset,
         record.simulated(config.env, expert, range(expert_episodes)) as disturbed,
     ):
-        by_policy = policy_play(config, environment, policy_episodes, load)
+        by_policy = policy_play(config, spec.tasks, policy_episodes, load)
         for episode in itertools.chain(by_policy, disturbed):
             record.save_episode(dataset, episode, tally)
             stage.update(tally["episodes"], f"{tally['successes']} successes")
     console.say("{episodes} episodes of play, {successes} successes".format(**tally))
 
 
-class WatchedEnvironment(WrappedEnvironment):
-    """An environment that keeps the newest observation in `seen`."""
+def policy_play(
+    config: RunConfig, tasks: tuple[str, ...], count: int, load: Load | None
+) -> Iterator[record.Episode]:
+    """Exploring episodes of a run's policy, with an observation at every env step."""
+    adapter = loader(load)(config.policy)
+    ended: list[record.Episode] = []
+    environments = []
+    for _ in range(min(count, config.rollout.environments)):
+        environments.append(RecordingEnvironment(make_environment(config.env), ended))
+    plans = EpisodePlans(tasks, config.seed, count, PLAY_WORKER)
+    plans.exploring = True
+    runner = RolloutRunner(environments, plans, config.rollout)
+    with closing(runner):
+        requests = {slot: runner.start(slot) for slot in range(len(runner))}
+        while due := {slot: request for slot, request in requests.items() if request}:
+            for slot, decision in zip(due, adapter.decide(list(due.values()), 0), strict=True):
+                requests[slot] = runner.advance(slot, decision)
+            runner.segments.clear()
+            runner.results.clear()
+            yield from ended
+            ended.clear()
 
-    seen: Observation
+
+class RecordingEnvironment(WrappedEnvironment):
+    """An environment that adds its whole episodes to `ended`."""
+
+    def __init__(self, environment: Environment, ended: list[record.Episode]) -> None:
+        super().__init__(environment)
+        self._ended = ended
 
     def reset(self, seed: int, task: str) -> Observation:
-        self.seen = super().reset(seed, task)
-        return self.seen
+        self._observation = super().reset(seed, task)
+        self._steps: list[record.PlayedStep] = []
+        return self._observation
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        result = self._environment.step_chunk(actions)
-        self.seen = result.observation
-        return result
-
-
-def policy_play(
-    config: RunConfig, environment: WatchedEnvironment, count: int, load: Load | None
-) -> Iterator[record.Episode]:
-    """Exploring episodes of a run's policy, of each task in turn, with an observation at every env step."""
-    if not count:
-        return
-    adapter = loader(load)(config.policy)
-    tasks = environment.spec.tasks
-    for number in range(count):
-        seed = train_seed(config.seed, PLAY_WORKER, number)
-        task = tasks[number % len(tasks)]
-        actions = explored(adapter, environment, task, seed)
-        episode = record.played(environment, task, seed, actions)
-        bad = nonfinite(environment.seen | episode.observations | {"the reward": episode.rewards})
-        if bad:
-            logger.warning("an episode of play is dropped: %s is not finite", bad)
-        else:
-            yield episode
-
-
-def explored(
-    adapter: PolicyAdapter, environment: WatchedEnvironment, task: str, seed: int
-) -> Iterator[np.ndarray]:
-    """Actions of the policy for what the environment shows, without end."""
-    spec = environment.spec
-    steps = 0
-    for number in itertools.count():
-        if number and nonfinite(environment.seen):
-            return
-        request = Request(
-            observation=environment.seen,
-            noise_seed=noise_seed(seed, number),
-            elapsed=steps / spec.max_steps,
-            task=task,
-        )
-        [decision] = adapter.decide([request], 0)
-        steps += len(decision.chunk)
-        yield from np.clip(decision.chunk, spec.action_low, spec.action_high).astype(np.float32)
+        rewards = []
+        actions = np.clip(actions, self.spec.action_low, self.spec.action_high).astype(np.float32)
+        for action in actions:
+            result = self._environment.step_chunk(action[None])
+            rewards.append(result.rewards)
+            self._steps.append((self._observation, action, result))
+            self._observation = result.observation
+            if result.done:
+                self._ended.append(record.episode_of(self._steps))
+                break
+        return replace(result, rewards=np.concatenate(rewards))

@@ -334,8 +334,7 @@ def policy_to_be(config: RunConfig) -> Any:
                 raise
             hint = error.hint
             if error.field != "policy.path":
-                name = error.field.removeprefix("policy.")
-                hint = f"{name}={error.value}: {hint}"
+                hint = f"{error.field.removeprefix('policy.')}={error.value}: {hint}"
             raise InputError("sft.init_path", start.path, hint) from error
     policy_config = check_sft_policy(config.sft)
     sampler_config(config.policy, config.sft.policy["type"])

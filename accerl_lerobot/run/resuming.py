@@ -106,11 +106,11 @@ def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig
     if config.policy.tuning.mode != "lora":
         return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
-    path = config.policy.path or str(warm_started(directory))
-    if Path(path).is_absolute() and not Path(path).exists():
+    path = Path(config.policy.path or warm_started(directory))
+    if path.is_absolute() and not path.exists():
         hint = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
         hint += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
-        raise InputError("policy.path", path, hint)
+        raise InputError("policy.path", str(path), hint)
     return improving(config, path)
 
 

@@ -188,7 +188,7 @@ class ImaginedEnvironment(Environment):
         actions = checked_actions(actions, self.spec)
         # Equal episodes in any process, although a model may draw from the global generator.
         with torch.random.fork_rng(devices=()):
-            torch.manual_seed(noise_seed(self._seed, self._steps) % 2**63)
+            torch.manual_seed(noise_seed(self._seed, self._steps))
             prediction = self._world.step(self._state, actions)
         self._state = prediction.state
         frames = prediction.frames[0].numpy()

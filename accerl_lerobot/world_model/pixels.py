@@ -198,11 +198,8 @@ class SuccessModel(nn.Module):
     @torch.no_grad()
     def probabilities(self, frames: Tensor, codes: Tensor) -> Tensor:
         """float32 (N,), of frames uint8 (N, V, H, W, 3) and task codes (N, 16)."""
-        logits = [
-            self(_to_floats(some), their_codes)
-            for some, their_codes in zip(frames.split(AT_ONCE), codes.split(AT_ONCE), strict=True)
-        ]
-        return torch.sigmoid(torch.cat(logits))
+        parts = zip(frames.split(AT_ONCE), codes.split(AT_ONCE), strict=True)
+        return torch.cat([self(_to_floats(some), of_these) for some, of_these in parts]).sigmoid()
 
     def loss(self, frames: Tensor, codes: Tensor, success: Tensor) -> Tensor:
         """Cross-entropy on frames that are shifted, lit and noisy at random; success is bool (N,)."""

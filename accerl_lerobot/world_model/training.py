@@ -161,7 +161,7 @@ class Trainer:
         return metrics | {"loss": loss.item(), "grad_norm": norm}
 
     def metrics(self) -> dict[str, float]:
-        return {"learn_steps": float(self.serving.version), "learn_episodes": float(len(self.played))}
+        return {"learn_steps": self.serving.version, "learn_episodes": len(self.played)}
 
     def state(self) -> dict[str, Any]:
         """Copies all that `restore` needs; see `snapshot`."""
@@ -308,7 +308,7 @@ class OnlineLearningWorker:
     def metrics(self) -> dict[str, float]:
         """Counts; ``version`` is that of `weights`."""
         self._clock.beat()
-        return self._trainer.metrics() | {"version": float(self._newest[0])}
+        return self._trainer.metrics() | {"version": self._newest[0]}
 
     def weights(self) -> tuple[int, dict[str, Any]]:
         """The newest version and its weights."""
