@@ -115,11 +115,8 @@ class Victim:
         return self.process.wait(grace), below
 
     def kill(self) -> list[int]:
-        """Ends it and all below it, whatever they do, but for guardians, which clean up; who they were."""
-        below = [
-            pid for pid in descendants(self.process.pid) if "accerl_lerobot/guardian.py" not in title(pid)
-        ]
-        everyone = [self.process.pid, *below]
+        """Ends it and all below it, whatever they do; who they were."""
+        everyone = [self.process.pid, *descendants(self.process.pid)]
         for pid in everyone:
             hit(pid, signal.SIGKILL)
         self.process.wait()

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from accerl_lerobot import __version__
 from accerl_lerobot.engines.stopping import TerminatedError, interrupted
@@ -76,7 +76,7 @@ def run(verb: str, rest: list[str]) -> int:
     if section is not None:
         return show_help(verb, rest, section)
     path = FUNCTIONS.get(verb, f"verbs:{verb.replace('-', '_')}")
-    with guarded():
+    with interrupted():
         function: Callable[[list[str]], int] = imported(f"accerl_lerobot.cli.{path}")
         return function(rest)
 
@@ -158,13 +158,3 @@ class _Printable(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record), keep="\n\t")
-
-
-@contextlib.contextmanager
-def guarded() -> Iterator[None]:
-    """Ends and removes, on the way out, whatever is started within and left behind."""
-    from accerl_lerobot import guardian
-
-    guardian.start()  # before anything that it is to clean up
-    with interrupted():
-        yield

@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +26,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from accerl_lerobot import guardian
 from accerl_lerobot.config.machine import SIMULATOR_GIB, free_memory_gib
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
@@ -173,7 +173,6 @@ def appearing(root: Path) -> Iterator[Path]:
     """A folder to be filled, which becomes `root` when the context is left, or goes if there was an error."""
     partial = root.with_name(f"{root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    guardian.remove(partial)
     try:
         yield partial
         partial.rename(root)
@@ -228,7 +227,16 @@ def _start(env_config: EnvConfig) -> None:
     """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
     global _environment
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _environment = make_environment(env_config)
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its parent has been killed, which could not end it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 @contextmanager

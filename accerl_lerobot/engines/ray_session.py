@@ -4,8 +4,9 @@
 The Ray is a private one on this machine, or the cluster of ``launch.address``.
 
 A private Ray listens on the loopback interface and asks for a token that only this user's processes know. Its
-sockets and logs are in a folder that the guardian removes. A run that joins a cluster uses the user's token
-and leaves the cluster as it is.
+sockets and logs are in a folder that is removed at the end of the process. If the process is killed, Ray ends
+its own processes and the folder stays. A run that joins a cluster uses the user's token and leaves the
+cluster as it is.
 
 A `Placement` has the nodes of each role's workers, and their share of a GPU, as options that Ray schedules
 by. By default everything is on the node where the run is started, and processes with a network share its
@@ -19,11 +20,13 @@ before anything does.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import logging
 import math
 import os
 import secrets
+import shutil
 import socket
 import sys
 import tempfile
@@ -32,7 +35,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.engines.stopping import handled
@@ -87,7 +89,7 @@ def prepare(joins: bool = False) -> None:
         # Sockets and logs: Ray's own choice is a folder of all users, in which they stay.
         folder = tempfile.mkdtemp(prefix="accerl-", dir="/tmp")
         os.environ["RAY_TMPDIR"] = folder
-        guardian.remove(Path(folder))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)  # after Ray's own end
     if not any(os.environ.get(key) for key in _AUTH):
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever ends a process, nothing that it has started is left; signals are noted, or heeded at once."""
+"""Signals are noted, or heeded at once; processes that simulate end with their parent."""
 
+import contextlib
 import multiprocessing
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -22,55 +24,6 @@ from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.run.resuming import continued
 from tests.runs import eventually
 
-PARENT = """
-import multiprocessing, os, signal, subprocess, sys, time
-from pathlib import Path
-from accerl_lerobot import guardian
-
-def child(semaphore):
-    subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])  # it has no parent soon
-    time.sleep(600)
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever started the tests may ignore it
-    guardian.start()
-    folder = Path(sys.argv[1])
-    folder.mkdir()
-    guardian.remove(folder)
-    context = multiprocessing.get_context("spawn")
-    semaphore = context.Semaphore()
-    context.Process(target=child, args=(semaphore,), daemon=True).start()
-    Path(sys.argv[2]).write_text(semaphore._semlock.name + " " + os.environ[guardian.MARK])
-    guardian._process.terminate()  # as by a scheduler, which asks all processes to stop
-    if sys.argv[3] == "return":
-        sys.exit(0)
-    os.kill(os.getpid(), signal.Signals[sys.argv[3]])
-"""
-
-
-def below(mark: str) -> list[psutil.Process]:
-    """Processes that have a mark in their environment."""
-    found = []
-    for process in psutil.process_iter():
-        try:
-            if mark in process.environ().get("ACCERL_GUARDED_BY", "").split():
-                found.append(process)
-        except psutil.Error:
-            continue
-    return [p for p in found if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /dev/shm")
-@pytest.mark.parametrize("how", ["SIGKILL", "SIGHUP", "return"])
-def test_nothing_is_left_however_a_process_ends(how: str, tmp_path: Path):
-    program, folder, note = tmp_path / "parent.py", tmp_path / "folder", tmp_path / "note"
-    program.write_text(PARENT)
-    command = [sys.executable, str(program), str(folder), str(note), how]
-    subprocess.run(command, capture_output=True, timeout=240)  # waits for the guardian, too
-    semaphore, mark = note.read_text().rsplit(" ", 1)
-    assert eventually(lambda: not below(mark) and not folder.exists())
-    assert eventually(lambda: not Path(f"/dev/shm/sem.{semaphore.strip('/')}").exists())
-
 
 def play(environment: Environment, seconds: int) -> bool:
     time.sleep(seconds)
@@ -85,6 +38,39 @@ def test_simulators_end_at_once_when_their_parent_is_interrupted():
         assert set(multiprocessing.active_children()) - before
         raise KeyboardInterrupt
     assert eventually(lambda: not set(multiprocessing.active_children()) - before)
+
+
+KILLED = """
+import os, signal
+from accerl_lerobot.demos.record import simulated
+from accerl_lerobot.envs import SimulatedConfig
+from tests.test_stopping import play
+
+if __name__ == "__main__":
+    with simulated(SimulatedConfig(), play, [0, 3600]) as results:
+        next(results)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_simulators_end_when_their_parent_is_killed(tmp_path: Path):
+    program = tmp_path / "parent.py"
+    program.write_text(KILLED)
+    mark = secrets.token_hex(8)
+    environment = os.environ | {"PYTHONPATH": os.getcwd(), "ACCERL_TEST": mark}
+    subprocess.run([sys.executable, str(program)], env=environment, timeout=240)
+    assert eventually(lambda: not marked(mark))
+
+
+def marked(mark: str) -> list[int]:
+    """Processes whose environment has a mark, but for Python's own trackers of what they share."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            tracker = any("resource_tracker" in word for word in process.cmdline())
+            if process.environ().get("ACCERL_TEST") == mark and not tracker:
+                found.append(process.pid)
+    return found
 
 
 def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():
