@@ -8,11 +8,12 @@ import sys
 from contextlib import redirect_stdout
 from typing import Any
 
-from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
+from accerl_lerobot.cli import exit_code, help_asked, set_up_logging
 from accerl_lerobot.cli.verbs import tell
 from accerl_lerobot.config.help import help_text
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.console import Console
+from accerl_lerobot.engines.stopping import interrupted
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.environment import BenchEnvironmentConfig
@@ -66,7 +67,7 @@ def run(name: str, rest: list[str]) -> int:
         text = help_text(f"python -m benchmarks {name}", CONFIGS[name], brief(name), section)
         sys.stdout.write(f"{text}\n")
         return 0
-    with guarded():
+    with interrupted():
         return measure(name, parse(CONFIGS[name], rest))
 
 

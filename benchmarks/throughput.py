@@ -66,7 +66,7 @@ class Measured(AbstractContextManager["Measured"]):
 
     def block(self, schedule: Schedule, seconds: float) -> Block:
         """Measures at least so many seconds of a schedule, in whole updates, after a change has settled."""
-        self.engine.follow(schedule)
+        self.engine.set_schedule(schedule)
         self._updates(1, 0.0)  # updates made before are reported first
         self._updates(SETTLE + self._round, 0.0)
         psutil.cpu_percent()  # begins to count

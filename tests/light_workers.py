@@ -40,16 +40,15 @@ class LightInference:
         if trainer is not None:
             version, _ = await trainer.newer_than.remote(self._name, -1)
             self._version = max(0, version)
-            await self.follow(trainer, version)
         return os.getpid()
 
-    async def follow(self, trainer: Any, version: int = -1) -> None:
+    async def follow(self, trainer: Any) -> None:
         async def follow(version: int) -> None:
             while True:
                 version, _ = await trainer.newer_than.remote(self._name, version)
                 self._version = max(0, version)
 
-        self._following = asyncio.create_task(follow(version))
+        self._following = asyncio.create_task(follow(-1))
 
     async def serve(self) -> None:
         self._serving.set()

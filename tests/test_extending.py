@@ -20,7 +20,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from accerl_lerobot import load_policy
 from accerl_lerobot.algorithms import AlgorithmConfig, chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.ratio_update import make_update
+from accerl_lerobot.algorithms.update import make_update
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment

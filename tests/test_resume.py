@@ -230,7 +230,7 @@ def test_a_finished_run_goes_back_to_an_earlier_checkpoint(
     assert go_on(run, config="checkpoints/000010/config.yaml") == 2
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
     monkeypatch.undo()
-    monkeypatch.setattr(Run, "_practise_once", failing)
+    monkeypatch.setattr(Run, "_practise_with_engine", failing)
     assert go_on(run, config="checkpoints/000010/config.yaml") == 2
     assert not (run / "summary.json").exists(), "it tells of the end that was given up"
     monkeypatch.undo()

@@ -26,7 +26,7 @@ from tests.runs import polls
 
 def test_in_turn_who_brings_the_last_segment_waits_until_it_is_learned_from():
     async def scene(worker: Any) -> None:
-        await worker.follow(SYNCHRONOUS)
+        await worker.set_schedule(SYNCHRONOUS)
         asked = start(worker.sample(BATCH, 0))
         assert await waits(asked)
         assert await worker.insert([make_segment("a", 4)])  # half a batch: go on
@@ -45,7 +45,7 @@ def test_in_turn_who_brings_the_last_segment_waits_until_it_is_learned_from():
 
 def test_with_overlap_one_batch_is_collected_meanwhile():
     async def scene(worker: Any) -> None:
-        await worker.follow(OVERLAP)
+        await worker.set_schedule(OVERLAP)
         asked = start(worker.sample(BATCH, 0))
         await waits(asked)
         assert await worker.insert([make_segment("a", 8)])

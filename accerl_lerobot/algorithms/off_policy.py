@@ -19,7 +19,7 @@ from torch import Tensor
 from accerl_lerobot.algorithms import AWRConfig, OffPolicyConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
-from accerl_lerobot.algorithms.ratio_update import STD_EPSILON, BaseUpdate
+from accerl_lerobot.algorithms.update import STD_EPSILON, BaseUpdate
 from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Metrics, Observations, Segment

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from accerl_lerobot.config.machine import GIB, free_memory_gib
-from accerl_lerobot.engines.config import lag_limits
+from accerl_lerobot.engines.config import in_flight, lag_limits
 from accerl_lerobot.errors import InputError, check_absent, expanded, in_one_line, last_exception
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def pace(config: RunConfig) -> Iterator[Check]:
     replay = config.replay
     trainer = config.trainer
     bound, of_pace = lag_limits(config)
-    text = f"at most {bound} updates with {config.rollout.in_flight} decisions under way"
+    text = f"at most {bound} updates with {in_flight(config)} decisions under way"
     hint = (
         f"the pace alone allows {of_pace}, so segments may be thrown away as too old; lower replay.capacity, "
         "replay.max_unlearned_decisions or replay.samples_per_insert, or raise replay.max_lag"

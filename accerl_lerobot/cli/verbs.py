@@ -50,11 +50,11 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     """``accerl train``; `load` makes the policy's adapter, of LeRobot's checkpoint by default."""
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot.engines.stopping import StoppedError
-    from accerl_lerobot.run import train as run
+    from accerl_lerobot.run import train as runs
 
     console = Console()
     try:
-        directory, summary = run.start(config, console, read_arguments(arguments)[0], load)
+        directory, summary = runs.start(config, console, read_arguments(arguments)[0], load)
     except StoppedError as stopped:
         console.say(str(stopped))
         return 128 + stopped.number
@@ -158,13 +158,13 @@ def evaluate(arguments: list[str]) -> int:
         out = expanded(config.output_dir, "output_dir")
         check_absent(out)
     from accerl_lerobot.evaluation import summarise, table, write_video
-    from accerl_lerobot.run import train as run
+    from accerl_lerobot.run import train as runs
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
     console = Console()
     with redirect_stdout(sys.stderr):
-        results = run.play_evaluation(whole, console, config.evaluation.videos if out else 0)
+        results = runs.play_evaluation(whole, console, config.evaluation.videos if out else 0)
     policy = config.policy.path
     local = expanded(str(policy), "policy.path")
     if local.exists():

@@ -194,14 +194,19 @@ class RunConfig(Section):
                 raise InputError(name, value, f"{only} {why}; use {wanted}")
 
 
+def in_flight(config: RunConfig) -> int:
+    """Decisions that environments of equal speed make while a segment is on its way to replay."""
+    rollout = config.rollout
+    environments = rollout.environments + config.imagination.environments
+    return rollout.workers * environments * rollout.segment_length
+
+
 def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
     early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
-    rollout = config.rollout
-    environments = rollout.environments + config.imagination.environments
     counts = {
         "batch_decisions": config.trainer.batch_decisions,
-        "in_flight": rollout.workers * environments * rollout.segment_length,
+        "in_flight": in_flight(config),
         "pickup": early,
         "prefetch": early,
     }

@@ -49,7 +49,7 @@ class LocalEngine(Engine):
         self._clock = open_clock(config.timeline_folder, LOCAL)
         import torch
 
-        from accerl_lerobot.algorithms.ratio_update import make_update
+        from accerl_lerobot.algorithms.update import make_update
 
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.trainer.num_threads)

@@ -54,7 +54,11 @@ POLL_S = 0.5
 
 
 class InferenceReplica(RestartedWorker):
-    """An inference replica; a restart loses nothing, as a request carries its noise and clients ask again."""
+    """An inference replica. A request carries its noise, and clients ask a restarted replica again.
+
+    So a restart loses nothing, except in ``accerl eval`` of a policy that keeps something between decisions:
+    `StockAdapter` refuses to go on with such an episode.
+    """
 
     trainer: Any = None  # handle of the trainer, once it publishes weights
     together = 0  # observations that are decided in lock step; 0: as they come
@@ -65,7 +69,7 @@ class InferenceReplica(RestartedWorker):
     def begin(self) -> None:
         self.started(self.actor.serve.remote())
         if self.trainer is not None:
-            self.actor.follow.remote(self.trainer)
+            self.actor.follow.remote(self.trainer)  # also where `train` asked while it was restarting
         if self.together:
             self.actor.lock_step.remote(self.together)
 
@@ -124,20 +128,20 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training = True
         self._last_change = time.monotonic()
-        self.follow(self._config.launch.schedule)
+        self.set_schedule(self._config.launch.schedule)
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor)
         for replica in self._inference:
             replica.trainer = self._trainer.actor
-            replica.actor.follow.remote(replica.trainer)  # lost if it is restarted, and then asked again
+            replica.actor.follow.remote(replica.trainer)  # `begin` asks again after a restart
 
-    def follow(self, schedule: Schedule) -> None:
+    def set_schedule(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.buffer`."""
         if schedule == self._schedule:
             return
         self._schedule = schedule
         # The trainer first: replay's turns wait for it to hand over its weights.
         for worker in (self._trainer, self._replay):
-            worker.call("follow", schedule)
+            worker.call("set_schedule", schedule)
         for index, replica in enumerate(self._inference):
             clients = len(self._rollouts[index :: len(self._inference)])
             together = clients * self._config.rollout.environments
@@ -146,8 +150,9 @@ class RayEngine(Engine):
 
     def poll(self) -> Progress:
         self._ask()
-        self._await_end()
+        self._wait_for_ends()
         episodes = self._listen()
+        self._end_collection()
         self._hand_over_world()
         self._supervise()
         updates = self._updates
@@ -300,7 +305,7 @@ class RayEngine(Engine):
             else:
                 worker.ask("metrics")
 
-    def _await_end(self) -> None:
+    def _wait_for_ends(self) -> None:
         """Wait a little, and handle every worker whose long call has ended."""
         works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
         if not ray.wait(list(works), num_returns=1, timeout=POLL_S)[0]:
@@ -320,14 +325,16 @@ class RayEngine(Engine):
         """Handle the end of a worker's long call that did not fail."""
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker is self._replay):
+            return
+        closed = self._done and worker is self._replay
+        if not closed:
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _finish(self, version: int) -> None:
         """The trainer has made its updates: complete its records and those of replay."""
         self._done = True
         self._version = version
-        self.follow(ASYNCHRONOUS)
+        self.set_schedule(ASYNCHRONOUS)
         self._hear(self._trainer, self._limit)
         self._updates += self._trainer.call("metrics")
         self._replay.call("close")
@@ -341,18 +348,22 @@ class RayEngine(Engine):
             answer = self._hear(worker)
             if answer is not None and isinstance(worker, RolloutSlot):
                 episodes += worker.take(answer)
-        may_end = not self._collected and not self._config.imagination.environments
-        if may_end and all(slot.spent for slot in self._rollouts):
+        return episodes
+
+    def _end_collection(self) -> None:
+        """Tell replay once every exploring episode of ``rollout.episodes`` is in it."""
+        if self._collected or self._config.imagination.environments:
+            return
+        if all(slot.spent for slot in self._rollouts):
             self._collected = True
             self._replay.call("end")
-        return episodes
 
     def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
         """Take the answer to the last question, if it has come; records of updates are kept."""
         try:
             answer = worker.answer(timeout)
         except RayError as error:
-            # Where a process has died, its long call has ended as well, which `_await_end` deals with.
+            # Where a process has died, its long call has ended as well, which `_wait_for_ends` deals with.
             if not (has_died(error) and isinstance(worker, RestartedWorker)):
                 worker.lost(error)
             return None

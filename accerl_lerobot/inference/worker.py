@@ -4,8 +4,8 @@
 consumes    requests for decisions, and the newest weights that the trainer has published
 produces    decisions, each stamped with the version of its weights
 waits for   a full batch, or until its oldest request has waited `max_wait_s`
-ends        with the run; an exception ends all connections, and Ray restarts the process, whose only state is
-            weights
+ends        with the run; an exception ends all connections, and Ray restarts the process. Its only state is
+            weights, except in ``accerl eval`` of a policy that keeps something between decisions
 
 Weights are swapped in between batches, so no batch sees two versions. One thread waits for clients and for
 the batcher's clock at once, runs the forward pass and replies. Ray's calls and weights come in on the event
@@ -77,6 +77,7 @@ class InferenceWorker:
         self._batcher: Batcher[PendingRequest] = Batcher(config.max_batch, config.max_wait_s)
         self._server = Server(self._add, node_address(in_cluster))
         self._version = version
+        self._fetched = -1  # version of the trainer's newest weights that have been applied
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._published: deque[tuple[int, Tensors]] = deque(maxlen=1)  # to be used from the next batch on
@@ -95,31 +96,31 @@ class InferenceWorker:
             version, references = await trainer.newer_than.remote(self._name, -1)
             if references:
                 self._adapter.load_trainable(await references[0])
-                self._version = version
-            await self.follow(trainer, version)
+                self._version = self._fetched = version
         return os.getpid()
 
     async def listen(self) -> Address:
         return self._server.address
 
-    async def follow(self, trainer: Any, version: int = -1) -> None:
+    async def follow(self, trainer: Any) -> None:
         """Use the weights of a trainer from now on, the newest whenever those before have been applied."""
         self._loop = asyncio.get_running_loop()
         if self._following is not None:
             self._following.cancel()
-        self._following = asyncio.create_task(self._follow(trainer, version))
+        self._following = asyncio.create_task(self._follow(trainer))
 
-    async def _follow(self, trainer: Any, version: int) -> None:
+    async def _follow(self, trainer: Any) -> None:
         from ray.exceptions import RayError  # not above: a config is read before Ray is imported
 
         with contextlib.suppress(RayError):  # a lost trainer is the engine's to deal with
             while True:
-                version, references = await trainer.newer_than.remote(self._name, version)
+                version, references = await trainer.newer_than.remote(self._name, self._fetched)
                 if references:
                     self._applied.clear()
                     self._published.append((version, await references[0]))
                     self._server.wake()
                     await self._applied.wait()
+                    self._fetched = version
 
     async def lock_step(self, observations: int) -> None:
         self._lock_step.append(observations)

@@ -50,8 +50,8 @@ class ReplayConfig(Section, section="replay"):
     """Size and pace of one replay."""
 
     capacity: Annotated[int, Range("[1, 100000000]")] = 4096
-    """Decisions held at most; the oldest segments leave first. At least `max_unlearned_decisions` plus one
-    segment."""
+    """Decisions held at most, those without draws left too; the oldest segments leave first. At least
+    `max_unlearned_decisions` plus one segment."""
     min_decisions: Annotated[int, Range("[1, 100000000]")] = 256
     """Decisions that must be held before the trainer starts (warm start), from 1 to `capacity`."""
     samples_per_insert: Annotated[float, Range("[1, 1000000]")] = 1.0
@@ -95,6 +95,8 @@ def lag_bound(
     config: ReplayConfig, *, batch_decisions: int, in_flight: int, pickup: int = 0, prefetch: int = 0
 ) -> int:
     """The largest lag of a decision that is drawn from replay, in updates, for people to read.
+
+    `max_lag` is enforced, by `Replay.retire`. The rest follows from the pace, as far as workers keep up.
 
         lag ≤ min(max_lag, pickup + drawn + prefetch)
         drawn = ⌊⌈samples_per_insert⌉ · (max(max_unlearned_decisions, min_decisions) + 2·in_flight +

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record of the real episodes, on disk: ``RUN/episodes.jsonl`` has a line per segment that replay has stored.
+"""Record of real exploring episodes: ``RUN/episodes.jsonl`` has a line per segment that replay has stored.
 
 Pictures are not in it; an environment that is given the same seed and actions shows the same again, at every
-env step and in any size. That is what `export.episodes` does.
+env step and in any size. That is what ``accerl export`` does.
 """
 
 from __future__ import annotations

@@ -115,11 +115,14 @@ class ReplayWorker:
                     return segments
 
     async def learnt(self) -> None:
-        """Note that the trainer has learned from a batch and handed over its weights."""
+        """Note that the trainer has learned from a batch and handed over its weights.
+
+        Only schedules in which both sides take turns look at it. Draws are counted in `sample`.
+        """
         async with self._changing():
             self._learning -= 1
 
-    async def follow(self, schedule: Schedule) -> None:
+    async def set_schedule(self, schedule: Schedule) -> None:
         async with self._changing():
             self._schedule = schedule
 
@@ -146,7 +149,7 @@ class ReplayWorker:
         self._clock.beat()
         return self._replay.metrics()
 
-    def _ready(self) -> bool:
+    def _has_batch(self) -> bool:
         return self._batch > 0 and self._replay.may_sample(self._batch)
 
     def _may_collect(self) -> bool:
@@ -154,11 +157,11 @@ class ReplayWorker:
         if self._schedule == ASYNCHRONOUS:
             return True
         if self._schedule == SYNCHRONOUS:
-            return not self._ready() and self._learning == 0
-        return not self._ready() or self._learning == 0
+            return not self._has_batch() and self._learning == 0
+        return not self._has_batch() or self._learning == 0
 
     def _may_draw(self) -> bool:
-        return self._ready() and (self._schedule == ASYNCHRONOUS or self._learning <= 0)
+        return self._has_batch() and (self._schedule == ASYNCHRONOUS or self._learning <= 0)
 
     @asynccontextmanager
     async def _changing(self) -> AsyncIterator[None]:

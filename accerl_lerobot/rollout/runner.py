@@ -64,11 +64,6 @@ class RolloutConfig(Section, section="rollout"):
     reward_model: RewardModelConfig = field(default_factory=RewardModelConfig)
     """The model that tells success, where the environment does not."""
 
-    @property
-    def in_flight(self) -> int:
-        """Decisions that environments of equal speed make while a segment is on its way to replay."""
-        return self.workers * self.environments * self.segment_length
-
 
 @kind
 @dataclass(frozen=True, kw_only=True)

@@ -61,12 +61,12 @@ class Report:
     """Seconds for which its thread has been at what it does now; 0 before `RolloutWorker.run`."""
     in_environment: bool = False  # True if that is to step or reset an environment
     moves: int = 0  # resets and executed chunks of its environments
-    spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
+    spent: bool = False  # every exploring episode of ``rollout.episodes`` has been played, and replay has it
     starts: int = 0  # see `EpisodePlans.starts`
 
 
 class RolloutWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another."""
+    """Becomes a threaded Ray actor in `engines.ray_engine`: `run` on one thread, `report` on another."""
 
     def __init__(
         self,

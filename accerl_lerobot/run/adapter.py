@@ -40,10 +40,11 @@ Reader = Callable[[Segment], Iterator[Segment]]
 def make_adapter(
     algorithm: AlgorithmConfig,
     state_model: StateModelConfig,
+    policy: PolicyConfig,
+    *,
     environment_state: int,
     remembered: Reader | None,
     load: Load | None,
-    policy: PolicyConfig,
 ) -> Any:
     """The adapter of a policy, with the teacher and the demonstrations that the algorithm learns from.
 

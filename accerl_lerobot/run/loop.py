@@ -98,7 +98,7 @@ class RunState:
     note: str = ""  # of the last of them that had one, see `EpisodeResult`
     lags: list[float] = field(default_factory=list)
     lag_max: float = 0.0
-    mismatch_max: float = 0.0
+    ratio_max_dev: float = 0.0
     base: dict[str, float] = field(default_factory=dict)  # counters when training began
     steps: float = math.inf  # env steps of the training, once it has ended
     evaluated: int = 0  # evaluations that were due by the number of updates
@@ -156,7 +156,7 @@ class Recorder:
             version = int(metrics["update"])
             state.lags.append(metrics["lag_mean"])
             state.lag_max = max(state.lag_max, metrics["lag_max"])
-            state.mismatch_max = max(state.mismatch_max, metrics.get("ratio_max_dev", 0.0))
+            state.ratio_max_dev = max(state.ratio_max_dev, metrics.get("ratio_max_dev", 0.0))
             self.log.write("train", version, metrics)
             self.times.furthest = max(self.times.furthest, version)
 
@@ -240,9 +240,9 @@ class Loop:
         self._began_at: str | None = None  # name of the checkpoint that this engine has begun from
         self._saved_at = time.monotonic()
 
-    def run(self, state: Path | None) -> dict[str, Any]:
+    def run(self, training_state: Path | None) -> dict[str, Any]:
         """Do the run, or the rest of it from a ``training_state``; returns the summary."""
-        filmed = self._begin() if state is None else self._resume(state)
+        filmed = self._begin() if training_state is None else self._resume(training_state)
         progress = self._train()
         self._save()
         self.recorder.warn_if_hopeless()
@@ -250,7 +250,7 @@ class Loop:
         summary: dict[str, Any] = plain(self._summary(after, progress))
         layout.write_json(self.directory / layout.SUMMARY, summary)
         self._draw(filmed, results)
-        layout.prune(self._checkpoints)  # it has ended
+        layout.prune(self._checkpoints)  # no replica restarts from `_began_at` any more
         return summary
 
     def _begin(self) -> list[EpisodeResult]:
@@ -384,7 +384,7 @@ class Loop:
             "restarts": int(last.rollout.get("restarts", 0)),
             "lag_mean": _mean(state.lags or [0.0]),
             "lag_max": state.lag_max,
-            "ratio_max_dev": state.mismatch_max,
+            "ratio_max_dev": state.ratio_max_dev,
             "wall_s": self.times.warm_s + self.recorder.log.wall_s,
             "warm_start_s": self.times.warm_s,
             "rl_s": self.times.rl_s,

@@ -40,7 +40,7 @@ COMPARED = 64  # decisions of successes, and of failures, whose imitation loss i
 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
     """Learn, and write ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
-    from accerl_lerobot.algorithms.ratio_update import make_update
+    from accerl_lerobot.algorithms.update import make_update
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import dry_run_config
 
@@ -57,7 +57,9 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
         algorithm = replace(algorithm, critic_steps=algorithm.critic_steps or 1.0)
     model = config.world_model or default_state_model(ENVIRONMENT_STATE in shapes)
     numbers = math.prod(shapes.get(ENVIRONMENT_STATE, (0,)))
-    adapter = make_adapter(algorithm, model, numbers, None, None, config.policy)
+    adapter = make_adapter(
+        algorithm, model, config.policy, environment_state=numbers, remembered=None, load=None
+    )
     update: Any = make_update(adapter, algorithm, config.trainer)
     counts = _remember(config, update, meta, shapes, console)
     losses = {"before": _imitation(update)}

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One run from start to summary: demonstrations → SFT → evaluation → asynchronous RL → evaluation.
 
-`loop` has the run itself, its processes and what each of them waits for. ``docs/cli.md`` lists the files of a
-run's folder.
+`start` opens Ray, `Run.execute` does the phases, `Run.practise` makes engines, `Loop.run` works with one.
+`loop` has the processes of a run and what each of them waits for. ``docs/cli.md`` lists the files of a run's
+folder.
 
 `train`, `resume`, `evaluate` and `load_policy` are the Python interface, imported from `accerl_lerobot`.
 Recording and Ray start processes that import the main module again, so a script calls `train` under
@@ -81,17 +82,17 @@ def discard_unused(directory: Path) -> None:
 
 
 def start(
-    config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
+    config: RunConfig, console: Console, recipe_path: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
-    """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
+    """Do a new run, or with ``config.resume`` the rest of the one whose config is at `recipe_path`."""
     with ray_session.opened(config.launch, now=config.resume or config.policy.path is not None):
         resume_from = None
         if config.resume:
-            directory, resume_from = resuming.resumed_run(recipe, config)
+            directory, resume_from = resuming.resumed_run(recipe_path, config)
         else:
             directory = make_output_dir(config)
         run = Run(config, directory, console, resume_from, load)
-        return directory, run.do()
+        return directory, run.execute_locked()
 
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
@@ -153,17 +154,22 @@ def make_engine(
     config = _with_absolute_paths(config)
     if state is not None:
         state = state.absolute()
-    numbers = history * spec.environment_state_dim
-    remembered = demonstrations_of(config)
-    load = functools.partial(make_adapter, config.algorithm, config.state_model, numbers, remembered, load)
+    load_with_teacher = functools.partial(
+        make_adapter,
+        config.algorithm,
+        config.state_model,
+        environment_state=history * spec.environment_state_dim,
+        remembered=demonstrations_of(config),
+        load=load,
+    )
     if config.launch.engine == "local":
         from accerl_lerobot.engines.local import LocalEngine
 
-        return LocalEngine(config, spec.tasks, history, state, load)
+        return LocalEngine(config, spec.tasks, history, state, load_with_teacher)
     ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engines.ray_engine import RayEngine
 
-    return RayEngine(config, spec.tasks, history, state, load, learns)
+    return RayEngine(config, spec.tasks, history, state, load_with_teacher, learns)
 
 
 def fine_tune(
@@ -232,9 +238,9 @@ class Run:
         self.resume_from = resume_from
         self.load = load
         self.times = Times()
-        self.how = resuming.resume_command(directory, config)
+        self.resume_command = resuming.resume_command(directory, config)
 
-    def do(self) -> dict[str, Any]:
+    def execute_locked(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
         try:
             with redirect_stdout(sys.stderr), kept_traceback(self.directory), resuming.locked(self.directory):
@@ -247,7 +253,7 @@ class Run:
             raise
         except BaseException as error:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-            self.console.say(f"{reason}; to resume: {self.how}")
+            self.console.say(f"{reason}; to resume: {self.resume_command}")
             raise
 
     def execute(self) -> dict[str, Any]:
@@ -299,7 +305,7 @@ class Run:
 
     def practise(self, checkpoint: Path | None) -> dict[str, Any]:
         """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""
-        stop = Stopping(self.how)
+        stop = Stopping(self.resume_command)
         lost = 0
         most = self.config.launch.max_restarts
         with (
@@ -310,7 +316,7 @@ class Run:
             while True:
                 furthest = self.times.furthest
                 try:
-                    return self._practise_once(checkpoint, stop, log)
+                    return self._practise_with_engine(checkpoint, stop, log)
                 except WorkerError as loss:
                     self.times.clock.enter(RECOVERY)
                     stop.check()
@@ -322,16 +328,18 @@ class Run:
                     layout.go_back_to(checkpoint)
                     self.config = resuming.continued(self.config, self.directory, checkpoint)
 
-    def _practise_once(self, checkpoint: Path | None, stop: Stopping, log: MetricsLog) -> dict[str, Any]:
+    def _practise_with_engine(
+        self, checkpoint: Path | None, stop: Stopping, log: MetricsLog
+    ) -> dict[str, Any]:
         """The run, or the rest of it, by one set of workers."""
         history = 1 if self.load else check_policy(self.config, self.spec, own=True)
-        state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
+        training_state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
         with self.console.stage("starting workers"), stop.at_once():
-            engine = make_engine(self.config, self.spec, history, state, self.load)
+            engine = make_engine(self.config, self.spec, history, training_state, self.load)
         recorder = Recorder(self.config, log, self.console, self.times)
         with closing(engine):
             loop = Loop(self.config, self.directory, engine, self.spec.tasks, recorder, stop)
-            return loop.run(state)
+            return loop.run(training_state)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 
 if TYPE_CHECKING:
-    from accerl_lerobot.algorithms.ratio_update import BaseUpdate
+    from accerl_lerobot.algorithms.update import BaseUpdate
 
 LOAD_S = 600.0  # how long a rank may take to load its policy
 SHARE = 0.4
@@ -71,7 +71,7 @@ class LearnerSettings(NamedTuple):
 
     def begin(self, adapter: Any) -> BaseUpdate:
         """The updates, from the state on, once all ranks have come together."""
-        from accerl_lerobot.algorithms.ratio_update import make_update
+        from accerl_lerobot.algorithms.update import make_update
 
         update = make_update(adapter, self.algorithm, self.trainer)
         if self.state is not None:
@@ -153,8 +153,9 @@ class TrainerWorker:
             if self._online is not None:
                 self._online.learn.remote(batch)
             if self._update.version + 1 < updates:
+                # Drawn early: it is learned from one update later, and its lag counts there.
                 upcoming = replay.sample.remote(decisions, self._update.version + 1)
-            self._clock.enter(CHECKPOINT)  # while another thread holds the lock
+            self._clock.enter(CHECKPOINT)  # only `hold` keeps the lock from this thread
             with self._lock:
                 self._step(batch, segments, waited)
             asked = time.monotonic()
@@ -190,8 +191,8 @@ class TrainerWorker:
         self._clock.beat()
         return [self._history.popleft() for _ in range(len(self._history))]
 
-    def follow(self, schedule: Schedule) -> None:
-        """From now on, turns are taken with those who collect like this."""
+    def set_schedule(self, schedule: Schedule) -> None:
+        """Take turns with rollout workers from now on, unless the schedule is asynchronous."""
         self._in_turn = schedule != ASYNCHRONOUS
 
     def hold(self) -> tuple[int, list[Metrics]]:

@@ -265,7 +265,7 @@ def save_online(directory: Path, trainer: Trainer) -> None:
 
 
 class OnlineLearningWorker:
-    """The world-model process of a run that imagines; becomes a threaded Ray actor in `launch`.
+    """The world-model process of a run that imagines; becomes a threaded Ray actor in `engines.ray_engine`.
 
     consumes    the trainer's batches, of which it takes whole real episodes
     produces    versions of both models, which the driver hands to the rollout workers

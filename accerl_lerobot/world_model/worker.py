@@ -38,7 +38,7 @@ class Learned(NamedTuple):
 
 
 class WorldModelWorker:
-    """Becomes a threaded Ray actor in `launch`; one call at a time touches the model."""
+    """Becomes a threaded Ray actor in `engines.ray_engine`; one call at a time touches the model."""
 
     def __init__(self, seed: int, num_threads: int, timeline: Path | None = None) -> None:
         errors.collect_warnings()

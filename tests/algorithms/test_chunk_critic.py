@@ -22,7 +22,7 @@ from accerl_lerobot.algorithms import (
 from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.algorithms.config import OffPolicyConfig, TrainerConfig
 from accerl_lerobot.algorithms.off_policy import Memory, OffPolicyUpdate, weights
-from accerl_lerobot.algorithms.ratio_update import make_update
+from accerl_lerobot.algorithms.update import make_update
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError, NonFiniteError
 from accerl_lerobot.experience import (

@@ -199,6 +199,7 @@ def test_a_process_that_comes_later_is_ready_with_the_newest_weights(play):
         trainer.publish(3)
         assert await worker.ready(trainer) == os.getpid() and adapter.loaded == [3]
         assert [decision.version for decision in await ask(worker, 1)] == [3]
+        await worker.follow(trainer)
         trainer.publish(4)
         await trainer.flush()
         assert adapter.loaded == [3, 4]

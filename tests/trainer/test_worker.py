@@ -137,6 +137,6 @@ def test_in_turn_the_wait_for_a_batch_does_not_hold_that_for_the_readers(monkeyp
     flushed: list[int] = []
     stage = Stage(updates=3)
     monkeypatch.setattr(WeightPublisher, "flush", lambda self: flushed.append(len(stage.worker._history)))
-    stage.worker.follow("synchronous")
+    stage.worker.set_schedule("synchronous")
     stage.run()
     assert flushed == [0, 1, 2, 3], "each version before its record is complete, and the last once more"
