@@ -65,13 +65,12 @@ def write_policy(
 
 def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
-    heads = {"num_attention_heads": 2, "num_key_value_heads": 1}
     vision = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
     backbone = write_backbone(
         directory.parent / f"{directory.name}-backbone",
         ["Match the target"],
         BackboneConfig(hidden=32, patch=8),
-        text=heads,
+        text={"num_attention_heads": 2, "num_key_value_heads": 1},
         vision=vision | {"image_size": image},
     )
     return {

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from pydoc import locate
 from typing import Any
@@ -17,14 +16,12 @@ from typing import Any
 import pytest
 import torch
 from huggingface_hub import constants
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.modeling_act import ACTPolicy
 from safetensors.torch import load_file, save_file
 from transformers import dynamic_module_utils
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, displaced, save_checkpoint
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.deferred import OURS
 from accerl_lerobot.policies.loading import (
@@ -103,9 +100,7 @@ def test_a_config_of_something_else(damaged: Any, text: str, why: str):
         ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian or chunk_n"),
     ],
 )  # fmt: skip
-def test_options_under_which_its_density_would_be_another(
-    damaged: Any, name: str, changes: dict, options: dict, sentence: str
-):
+def test_options_of_another_density(damaged: Any, name: str, changes: dict, options: dict, sentence: str):
     path = damaged(name)
     edit_config(path, **changes)
     refused(path, f"^{sentence}", **options)
@@ -241,16 +236,6 @@ def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
     assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 2, 5)
 
 
-def test_names_of_the_environment_s_features_are_mapped(written: Any):
-    path, request = written("smolvla"), requests(1)[0]
-    adapter = adapter_at(path, rename_map={"observation.images.top": "observation.images.front"})
-    observed, _ = stack_observations(adapter.example_requests())
-    assert observed.keys() == {"observation.images.top", "observation.state"}
-    renamed = {k.replace("front", "top"): v for k, v in request.observation.items()}
-    decision = adapter.decide([replace(request, observation=renamed)], 0)
-    assert pickle.dumps(decision) == pickle.dumps(adapter_at(path).decide([request], 0))
-
-
 @pytest.mark.parametrize("renames", [{}, {"observation.images.front": "observation.images.camera1"}])
 def test_inputs_of_the_base_policy_in_the_config_give_way_to_the_statistics(renames: dict, tmp_path: Path):
     """LeRobot keeps the base policy's: states of six numbers, three cameras."""
@@ -265,12 +250,10 @@ def test_inputs_of_the_base_policy_in_the_config_give_way_to_the_statistics(rena
     steps["steps"][0]["config"]["rename_map"] = renames
     (path / PROCESSOR).write_text(json.dumps(steps))
 
-    features = {
-        camera: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (4,)),
-    }
-    assert load_lerobot_config(PolicyConfig(path=str(path), device="cpu")).input_features == features
-    stored = json.loads((saved(path, tmp_path / "saved") / "config.json").read_text())["input_features"]
+    for folder in (path, saved(path, tmp_path / "saved")):
+        features = load_lerobot_config(PolicyConfig(path=str(folder), device="cpu")).input_features
+        assert {k: f.shape for k, f in features.items()} == {camera: (3, 32, 32), "observation.state": (4,)}
+    stored = json.loads((tmp_path / "saved" / "config.json").read_text())["input_features"]
     assert stored.keys() == features.keys() and stored["observation.state"]["shape"] == [4]
 
 
@@ -315,12 +298,9 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(name: str, tmp_pat
     adapter.save(tmp_path / "ours")
     for folder in (original, tmp_path / "original-hub"):
         shutil.rmtree(folder)
-    moved = Path(shutil.move(tmp_path / "ours", tmp_path / "moved"))
-    expected = pickle.dumps(adapter.decide(requests(3), 0))
-    assert decided(moved) == expected
-    adapter_at(moved).save(tmp_path / "second")
-    shutil.rmtree(moved)
-    assert decided(tmp_path / "second") == expected
+    adapter_at(tmp_path / "ours").save(tmp_path / "second")
+    shutil.rmtree(tmp_path / "ours")
+    assert decided(tmp_path / "second") == pickle.dumps(adapter.decide(requests(3), 0))
     content = "".join((tmp_path / "second" / file).read_text() for file in ("config.json", PROCESSOR))
     assert str(tmp_path) not in content, "others find the tokenisers where the original's were"
     assert PALIGEMMA in content and (ACTIONS in content) == (name == "pi0_fast")
@@ -341,9 +321,7 @@ def rename_statistics(path: Path, which: str = "*normalizer", old: str = "") -> 
         ("unnormalizer", "action: no mean and std of it, .*it has so100"),
     ],
 )
-def test_statistics_of_other_names_are_refused_unless_it_is_to_be_fine_tuned(
-    damaged: Any, which: str, why: str
-):
+def test_statistics_of_other_names_are_refused_unless_it_is_fine_tuned(damaged: Any, which: str, why: str):
     path = damaged("smolvla")
     rename_statistics(path, which)
     config = PolicyConfig(path=str(path), device="cpu")

@@ -4,6 +4,7 @@
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,9 +83,7 @@ def fast(written: Callable[[str], Path]) -> LeRobotAdapter:
 
 @pytest.mark.parametrize("sampler", ["sample_actions_fast_kv_cache", "sample_actions_fast"])
 @pytest.mark.parametrize("temperature", [1.0, 0.6])
-def test_lerobot_s_own_sampler_draws_from_the_same_probabilities(
-    fast: LeRobotAdapter, monkeypatch: pytest.MonkeyPatch, temperature: float, sampler: str
-):
+def test_lerobot_s_probabilities_are_ours(fast: Any, monkeypatch: Any, temperature: float, sampler: str):
     # It is made to draw our tokens, and the probabilities that it would have drawn from are read off.
     asked = requests(16)
     fast.family.sampler = TokenSamplerConfig(temperature=temperature)

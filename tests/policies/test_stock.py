@@ -278,9 +278,7 @@ write_pi0, write_pi05 = partial(write_pi, kind="pi0"), partial(write_pi, kind="p
         ),
     ],
 )  # fmt: skip
-def test_any_policy_learns_and_is_saved_for_stock_lerobot(
-    write: Any, algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_any_policy_learns_and_lerobot_loads_it(write: Any, algorithm: str, tmp_path: Path, monkeypatch: Any):
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 8)
     size = 64 if write in (write_vqbet, write_multi_task_dit, write_xvla) else 32

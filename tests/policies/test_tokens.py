@@ -103,8 +103,7 @@ def probabilities(model: Any, temperature: float = 1.0) -> list[float]:
     return [math.exp(sum(oracle(model, said, temperature)[0])) for said in sequences(model)]
 
 
-START = torch.randn(1, WIDTH, generator=torch.Generator().manual_seed(0))
-"""The observation."""
+START = torch.randn(1, WIDTH, generator=torch.Generator().manual_seed(0))  # the observation
 
 
 def encoded(model: Any, count: int) -> Encoded:

@@ -3,12 +3,14 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.configs import PushtEnv
+from lerobot.policies.factory import get_policy_class, make_policy
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.config.ranges import DatasetConfig
@@ -17,7 +19,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
-from accerl_lerobot.policies.loading import load_adapter, policy_sizes
+from accerl_lerobot.policies.loading import policy_sizes
 from accerl_lerobot.run.preflight import sft_policy
 from accerl_lerobot.testing import check_ratio_one, log_ratio, perturb, stored
 from tests.policies.cases import CASES
@@ -50,9 +52,7 @@ def policy_names(adapter: LeRobotAdapter) -> set[str]:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
-    written: Callable[[str], Path], name: str, tmp_path: Path
-):
+def test_low_rank_adapters_start_as_the_policy_and_are_saved_merged(written: Any, name: str, tmp_path: Path):
     path, asked = written(name), CASES[name].requests(8)
     adapter, plain = tuned(path, mode="lora", rank=2, targets=TARGETS[name]), adapter_at(path)
     names = policy_names(adapter)
@@ -77,7 +77,7 @@ def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_full_and_expert(written: Callable[[str], Path], name: str):
+def test_full_and_expert(written: Any, name: str):
     path = written(name)
     plain = adapter_at(path)
     acting = {k for k, _ in plain.policy.named_parameters() if not k.startswith(tuple(plain.model.idle))}
@@ -106,10 +106,6 @@ def test_targets_that_do_not_suit_the_policy(written: Any, name: str, targets: s
 
 def stock_policy(folder: Path) -> Any:
     """The policy as LeRobot's factory loads it, adapters included."""
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.envs.configs import PushtEnv
-    from lerobot.policies.factory import make_policy
-
     config = PreTrainedConfig.from_pretrained(folder)
     config.pretrained_path, config.device = folder, "cpu"
     return make_policy(config, env_cfg=PushtEnv(), rename_map={"a": "b"}).eval()
@@ -118,8 +114,6 @@ def stock_policy(folder: Path) -> Any:
 @pytest.fixture(scope="module")
 def adapted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An adapter's folder as ``lerobot-train --peft.method_type=LORA`` writes it."""
-    from lerobot.policies.factory import get_policy_class
-
     base = write_smolvla(tmp_path_factory.mktemp("peft") / "base")
     policy = get_policy_class("smolvla").from_pretrained(base)
     policy.config.pretrained_path = base
@@ -151,9 +145,8 @@ def chunk(policy: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
 
 
 def test_an_adapter_acts_as_in_lerobot_and_what_is_saved_of_it_does_too(adapted: Path, tmp_path: Path):
-    config = PolicyConfig(path=str(adapted), device="cpu")
-    assert policy_sizes(config).policy > 0
-    adapter = load_adapter(config)
+    assert policy_sizes(PolicyConfig(path=str(adapted), device="cpu")).policy > 0
+    adapter = adapter_at(adapted)
     batch = adapter.processing.prepare(*stack_observations(requests(2)))
     expected = chunk(stock_policy(adapted), batch)
     base = json.loads((adapted / "adapter_config.json").read_text())["base_model_name_or_path"]

@@ -20,7 +20,7 @@ from transformers import AutoConfig, dynamic_module_utils
 from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig
+from accerl_lerobot.policies.config import ChunkNoiseConfig
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import edit_config, write_smolvla
@@ -100,7 +100,7 @@ def test_a_critic_of_another_size(copied: Path):
     refused(copied, "^policy.path=.*value_head.safetensors: not of this policy; remove it to start anew")
 
 
-COMMIT, NEWER = "0" * 39 + "1", "0" * 39 + "2"
+REPOSITORY, COMMIT, NEWER = "them/model", "0" * 39 + "1", "0" * 39 + "2"
 CODE = """
 from pathlib import Path
 from transformers import PretrainedConfig
@@ -109,9 +109,6 @@ class TheirConfig(PretrainedConfig):
     model_type = "theirs"
     commit = {commit!r}
 """
-
-
-REPOSITORY = "them/model"
 
 
 @pytest.fixture
@@ -177,8 +174,8 @@ class Late(ProcessorStep):
 
 
 @pytest.mark.parametrize("sampler", [None, ChunkNoiseConfig()])
-def test_code_of_a_model_that_a_step_loads_when_it_is_called_is_refused(
-    marker: Path, copied: Path, sampler: SamplerConfig | None, monkeypatch: pytest.MonkeyPatch
+def test_code_of_a_model_that_a_step_loads_is_refused(
+    marker: Path, copied: Path, sampler: ChunkNoiseConfig | None, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setitem(ProcessorStepRegistry._registry, "late", Late)
     edit_steps(copied, lambda steps: steps.append({"registry_name": "late", "config": {"name": REPOSITORY}}))
@@ -186,9 +183,7 @@ def test_code_of_a_model_that_a_step_loads_when_it_is_called_is_refused(
     assert not marker.exists()
 
 
-def test_nothing_is_unpickled_and_weights_from_pytorch_itself_are_read_as_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_nothing_is_unpickled_and_weights_of_pytorch_s_are_read_as_data(tmp_path: Path, monkeypatch: Any):
     marker, hub = tmp_path / "was-run", tmp_path / "hub"
     hub.mkdir()
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(hub))

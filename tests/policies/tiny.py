@@ -19,8 +19,7 @@ from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.rollout.runner import ActiveEpisode, EpisodePlan
 
-TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
-"""Texts of different lengths, so that a batch pads some of them."""
+TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")  # a batch pads some of them
 
 
 def requests(count: int, *, explore: bool = True, seed: int = 0, image: int = 32) -> list[Request]:

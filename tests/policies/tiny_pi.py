@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """π0 and its kin at a tenth of a million parameters, offline.
 
-LeRobot's configs know two sizes of Gemma, 0.3 and 2 billion parameters, and write PaliGemma's vocabulary and
-widths over whatever else they are given. `small` puts other sizes in where LeRobot's modules look theirs up;
-everything else is LeRobot's own code. A policy is built from its config whenever it is loaded, so it must be
-active then, too.
+LeRobot's configs know two sizes of Gemma, 0.3 and 2 billion parameters. `small` puts other sizes in where
+LeRobot's modules look theirs up, whenever a policy is built or loaded; everything else is LeRobot's own code.
 """
 
 import contextlib
@@ -103,9 +101,8 @@ def write_tokenizer(directory: Path) -> Path:
     )
     raw.train_from_iterator(TEXTS, trainer)
     learnt = json.loads(raw.to_str())["model"]
-    vocabulary: dict[str, int] = learnt["vocab"]
-    for i in range(len(vocabulary), VOCABULARY):
-        vocabulary[f"<loc{i:04d}>"] = i
+    vocabulary = learnt["vocab"]
+    vocabulary |= {f"<loc{i:04d}>": i for i in range(len(vocabulary), VOCABULARY)}
     full = Tokenizer(models.BPE(vocab=vocabulary, merges=[tuple(pair) for pair in learnt["merges"]]))
     full.pre_tokenizer, full.decoder = raw.pre_tokenizer, decoders.ByteLevel()
     PreTrainedTokenizerFast(

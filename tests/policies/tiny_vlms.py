@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints of LeRobot's large vision-language-action policies with random weights of tiny size.
-
-Each backbone, with its tokeniser, is written beside the policy's folder.
-"""
+"""Tiny checkpoints of LeRobot's large vision-language-action policies, each with its backbone beside it."""
 
 from __future__ import annotations
 
@@ -32,6 +29,7 @@ TEMPLATE = (
 """Qwen-VL's chat template, without videos and tools."""
 ROOM = 64  # tokens that a policy may add to a tokeniser
 WIDTH = 16
+SIZES = {"hidden_size": WIDTH, "intermediate_size": WIDTH}
 WAN_CHANNELS = 48  # of Wan 2.2's video latents
 
 
@@ -52,13 +50,12 @@ def qwen_vl(folder: Path, text: dict[str, Any], vision: dict[str, Any]) -> tuple
     marks = ("<|im_start|>", "<|im_end|>", *named.values())
     tokenizer = write_letters(folder, *marks, chat_template=TEMPLATE)
     config = {f"{name}_token_id": tokenizer.convert_tokens_to_ids(mark) for name, mark in named.items()}
-    sizes = {"hidden_size": WIDTH, "intermediate_size": WIDTH}
-    config["text_config"] = sizes | text | {
+    config["text_config"] = SIZES | text | {
         "num_hidden_layers": 1, "num_attention_heads": 2, "num_key_value_heads": 1,
         "vocab_size": len(tokenizer) + ROOM,
         "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [2, 1, 1]},
     }  # fmt: skip
-    config["vision_config"] = sizes | vision | {"depth": 1, "num_heads": 2, "out_hidden_size": WIDTH}
+    config["vision_config"] = SIZES | vision | {"depth": 1, "num_heads": 2, "out_hidden_size": WIDTH}
     return config | {"dtype": "float32"}, tokenizer
 
 
@@ -85,9 +82,7 @@ def write_evo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
     """An EVO1 on a tiny InternVL, whose actions are wider than those that it executes."""
     backbone = directory.parent / f"{directory.name}-internvl"
     tokenizer = write_letters(backbone, "<img>", "</img>", "<IMG_CONTEXT>")
-    layers = {
-        "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_hidden_layers": 1, "num_attention_heads": 2,
-    }  # fmt: skip
+    layers = SIZES | {"num_hidden_layers": 1, "num_attention_heads": 2}
     text = layers | {"model_type": "qwen2", "num_key_value_heads": 1, "vocab_size": len(tokenizer)}
     vision = layers | {"image_size": (28, 28), "patch_size": (14, 14)}
     torch.manual_seed(0)
@@ -129,15 +124,14 @@ def write_molmoact2(directory: Path, *, image: int = 64, **options: Any) -> Path
         folder, "<|im_start|>", "<|im_end|>", *marks.values(), *states, *actions, padding_side="left"
     )
     ids = {name: tokenizer.convert_tokens_to_ids(mark) for name, mark in marks.items()}
-    heads = {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": WIDTH // 2}
-    sizes = {"hidden_size": WIDTH, "intermediate_size": WIDTH}
+    sizes = SIZES | {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": WIDTH // 2}
     torch.manual_seed(0)
     config = MolmoAct2Config(
-        vit_config=heads | sizes | {
+        vit_config=sizes | {
             "num_hidden_layers": 1, "image_default_input_size": (28, 28), "image_num_pos": 4,
         },
-        adapter_config=heads | sizes | {"vit_layers": (-1,), "text_hidden_size": WIDTH},
-        text_config=heads | sizes | {
+        adapter_config=sizes | {"vit_layers": (-1,), "text_hidden_size": WIDTH},
+        text_config=sizes | {
             "num_hidden_layers": 1, "vocab_size": len(tokenizer), "additional_vocab_size": 8,
         },
         action_expert_config={
