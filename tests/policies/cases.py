@@ -33,8 +33,7 @@ class Case:
     kind: str
     write: Callable[[Path], Path]
     samplers: tuple[SamplerConfig, ...]
-    parts: tuple[str, ...] = ()
-    """Parts of parameter names, whose gradients are compared with finite differences."""
+    parts: tuple[str, ...]  # of parameter names, whose gradients are compared with finite differences
     chunk: tuple[int, int] = (3, 2)
     image: int = 32
     ask: Callable[..., list[Request]] = requests
@@ -65,13 +64,12 @@ def lean(adapter: LeRobotAdapter, token: int, logit: float) -> None:
 UNET = ("rgb_encoder", "down_modules", "mid_modules", "up_modules", "final_conv")
 
 
-def _pi(kind: str, **fields: Any) -> Case:
-    parts = ("vision_tower", "paligemma.model.language_model", "gemma_expert", "action_out_proj")
+def _pi(kind: str) -> Case:
     return Case(
         kind=kind,
         write=lambda path: write_pi(path, kind, chunk=5, executed=3, padded_dim=4, action_dim=2),
         samplers=(FlowSamplerConfig(noise_level=0.4),),
-        parts=parts,
+        parts=("vision_tower", "paligemma.model.language_model", "gemma_expert", "action_out_proj"),
         context=small,
     )
 
@@ -123,7 +121,6 @@ CASES = {
         slack=0.06,
     ),
 }
-"""The seven types, by their names in LeRobot."""
 DDIM = {"noise_scheduler_type": "DDIM", "prediction_type": "sample", "num_inference_steps": 3}
 VARIANTS = {
     "diffusion, DDIM, one observation, batch norm": Case(

@@ -7,6 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+from transformers import BertTokenizer, CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModel
+
+from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
+
 
 def write_policy(
     directory: Path,
@@ -26,19 +34,13 @@ def write_policy(
     By the default `stats`, states and actions have a std of 0.5 around 0, or lie within ±2. `prepare` changes
     the weights before they are saved; `fields` are of LeRobot's policy config.
     """
-    import torch
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
-
     sizes = {"observation.state": state_dim, "action": action_dim}
-    inputs = {
-        camera: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image)),
-        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,)),
-    }
     options: dict[str, Any] = {
-        "input_features": inputs,
-        "output_features": {"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
+        "input_features": {
+            camera: PolicyFeature(FeatureType.VISUAL, (3, image, image)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (state_dim,)),
+        },
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (action_dim,))},
         "device": "cpu",
         "push_to_hub": False,
     }
@@ -63,15 +65,12 @@ def write_policy(
 
 def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
-    from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
-
-    heads = {"num_attention_heads": 2, "num_key_value_heads": 1}
     vision = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
     backbone = write_backbone(
         directory.parent / f"{directory.name}-backbone",
         ["Match the target"],
         BackboneConfig(hidden=32, patch=8),
-        text=heads,
+        text={"num_attention_heads": 2, "num_key_value_heads": 1},
         vision=vision | {"image_size": image},
     )
     return {
@@ -99,8 +98,6 @@ def write_smolvla(
 
 def write_multi_task_dit(directory: Path, **options: Any) -> Path:
     """A multi-task DiT for images of 64 pixels; its tiny CLIP models are written beside it."""
-    from transformers import CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModel
-
     vision, text = (str(directory.parent / name) for name in ("clip-vision", "clip-text"))
     small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
     CLIPVisionModel(CLIPVisionConfig(**small, image_size=64, patch_size=16)).save_pretrained(vision)
@@ -124,10 +121,9 @@ def write_xvla(directory: Path, *, image: int = 64, **options: Any) -> Path:
     patches = {"patch_size": [7, 3, 3, 3], "patch_stride": [4, 2, 2, 2], "patch_padding": [3, 1, 1, 1]}
     ends = {"max_position_embeddings": 10, "max_temporal_embeddings": 4}
     vision = stages | patches | ends | {"depths": [1] * 4, "window_size": 4, "projection_dim": 16}
-    layers = {f"{part}_layers": 1 for part in ("encoder", "decoder")}
-    layers |= {f"{part}_attention_heads": 2 for part in ("encoder", "decoder")}
-    layers |= {f"{part}_ffn_dim": 16 for part in ("encoder", "decoder")}
-    text = layers | {"model_type": "bart", "d_model": 16, "vocab_size": words, "max_position_embeddings": 64}
+    layers = {"layers": 1, "attention_heads": 2, "ffn_dim": 16}
+    text = {f"{part}_{name}": size for part in ("encoder", "decoder") for name, size in layers.items()}
+    text |= {"model_type": "bart", "d_model": 16, "vocab_size": words, "max_position_embeddings": 64}
     text |= {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
     fields = {
         "florence_config": {"vision_config": vision, "text_config": text, "image_token_id": 5},
@@ -140,13 +136,7 @@ def write_xvla(directory: Path, *, image: int = 64, **options: Any) -> Path:
 
 
 def write_words(folder: str, **marks: str) -> int:
-    """Saves a tokeniser that knows `marks` and the words of ``SimulatedConfig()``'s task.
-
-    Returns:
-        The number of words.
-    """
-    from transformers import BertTokenizer
-
+    """Saves a tokeniser of `marks` and of the words of ``SimulatedConfig()``'s task; returns their number."""
     words = [*marks.values(), "[UNK]", "[MASK]", "<image>", "match", "the", "target"]
     BertTokenizer(vocab={word: i for i, word in enumerate(words)}, **marks).save_pretrained(folder)
     return len(words)
@@ -183,15 +173,10 @@ def write_bins(
 ) -> Path:
     """A smolvla_bins of some 30 k parameters that fits ``SimulatedConfig()``, its backbone beside it."""
     import lerobot_policy_smolvla_bins  # noqa: F401
-    import torch
 
     low, high = (torch.full((2,), bound) for bound in action_range)
-    small = {
-        "chunk_size": chunk,
-        "n_action_steps": executed,
-        "num_bins": 32,
-        "stats": {"action": {"min": low, "max": high}},
-    }
+    small = {"chunk_size": chunk, "n_action_steps": executed, "num_bins": 32}
+    small["stats"] = {"action": {"min": low, "max": high}}
     return write_policy(directory, "smolvla_bins", **(with_backbone(directory, 32) | small | options))
 
 

@@ -11,7 +11,6 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -38,23 +37,18 @@ class Case(NamedTuple):
     """That of μ, (B,)."""
 
 
-def mixture(size: int, pi: bool) -> tuple[Tensor, Tensor]:
-    """Weights and biases of a mix of `size` entries, each of which hangs on every other."""
+def network(size: int, pi: bool) -> Callable[[Tensor, Any], Tensor]:
+    """A mix of `size` entries, each of which hangs on every other."""
     base, other = torch.Generator().manual_seed(7), torch.Generator().manual_seed(8)
     mix, added = 0.3 * torch.randn(size, size, generator=base), torch.zeros(size)
     mix[:2] = torch.tensor([0.3] + [0.8] * (size - 1))
     if pi:
         mix += 0.1 * torch.randn(size, size, generator=other)
         added = torch.tensor([-0.2] + [0.6] * (size - 1))
-    return mix, added
-
-
-def network(size: int, pi: bool) -> Callable[[Tensor, Any], Tensor]:
-    mix, added = mixture(size, pi)
 
     def predict(x: Tensor, t: Any) -> Tensor:
-        mixed = x.flatten(1) @ mix.T.to(x) + 0.3 * torch.as_tensor(t).view(-1, 1).to(x)
-        return (torch.tanh(mixed) + added.to(x)).view(x.shape)
+        mixed = x.flatten(1) @ mix.T + 0.3 * torch.as_tensor(t).view(-1, 1)
+        return (torch.tanh(mixed) + added).view(x.shape)
 
     return predict
 
@@ -109,9 +103,8 @@ def encoded(pi: bool, count: int) -> Encoded:
 
 
 def gaussian_family() -> GaussianFamily:
-    family = GaussianFamily(
-        SimpleNamespace(executed=2, action_dim=2, row_width=4), GaussianSamplerConfig(std=0.4)
-    )
+    model = SimpleNamespace(executed=2, action_dim=2, row_width=4)
+    family = GaussianFamily(model, GaussianSamplerConfig(std=0.4))
     with torch.no_grad():
         family.std.out.weight.copy_(torch.linspace(-1, 1, 8).view(2, 4))
     return family
@@ -171,62 +164,22 @@ def test_the_learned_std_of_a_gaussian_does_not_shape_the_features():
     assert read.context[1].grad is None and family.std.out.weight.grad.abs().max() > 0
 
 
-STD = 0.3
-
-
-def flow_of(num_steps: int, dtype: torch.dtype = torch.float64) -> tuple[FlowFamily, Tensor, Tensor]:
-    """Three rows of which two are executed, two real dims and two padded ones; noise of six decisions."""
+@pytest.mark.parametrize("num_steps", [1, 2, 3, 4])
+def test_a_flow_is_lerobot_s_sampler_with_noise_of_a_known_density(num_steps: int):
+    # Three rows of which two are executed, two real dims and two padded ones; some decisions explore.
     shape = FlowShape(num_steps=num_steps, chunk_size=3, executed=2, padded_dim=4, action_dim=2)
-    generator = torch.Generator().manual_seed(num_steps)
-    x0, eps = (torch.randn(6, 3, 4, generator=generator, dtype=dtype) for _ in range(2))
-    return FlowFamily(SimpleNamespace(shape=shape), FlowSamplerConfig(noise_level=STD)), x0, eps
-
-
-def slow_integrate(x0: np.ndarray, num_steps: int) -> np.ndarray:
-    """(B, K, D) from initial noise (B, K, D), one decision at a time."""
-    mix, added = (part.double().numpy() for part in mixture(12, MU))
-    result = np.zeros(x0.shape)
-    for b in range(len(x0)):
-        x = x0[b].ravel()
-        for k in range(num_steps):
-            x = x - (np.tanh(mix @ x + 0.3 * (num_steps - k) / num_steps) + added) / num_steps
-        result[b] = x.reshape(x0[b].shape)
-    return result
-
-
-@pytest.mark.parametrize("num_steps", [1, 2, 3, 4])
-def test_the_flow_s_action_and_its_density_are_the_oracle_s(num_steps: int):
-    flow, x0, eps = flow_of(num_steps)
-    velocity = network(12, MU)
-    _, latent, log_prob = flow.sample(velocity, x0, eps[:, None], torch.ones(6, dtype=torch.bool))
-    x, mean = latent["path"][:, 1].numpy(), slow_integrate(x0.numpy(), num_steps)
-    expected = np.zeros(6)
-    for b in range(6):
-        for row in range(2):
-            for dim in range(2):
-                z = (x[b, row, dim] - mean[b, row, dim]) / STD
-                expected[b] += -0.5 * z**2 - math.log(STD * math.sqrt(2 * math.pi))
-    assert np.allclose(x, mean + STD * eps.numpy(), atol=1e-12)
-    assert log_prob.shape == (6, 2) and np.allclose(log_prob.sum(1), expected, atol=1e-10)
-    assert torch.allclose(flow.log_prob(velocity, latent), log_prob, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("num_steps", [1, 2, 3, 4])
-def test_a_flow_that_does_not_explore_is_the_stock_sampler_bit_for_bit(num_steps: int):
-    flow, x0, eps = flow_of(num_steps, torch.float32)
+    family = FlowFamily(SimpleNamespace(shape=shape), FlowSamplerConfig(noise_level=0.3))
+    draw = torch.Generator().manual_seed(num_steps)
+    x0, eps = (torch.randn(6, 3, 4, generator=draw) for _ in range(2))
     velocity, stock, dt = network(12, MU), x0, -1.0 / num_steps
     for step in range(num_steps):  # LeRobot's loop
         stock = stock + dt * velocity(stock, torch.tensor(1.0 + step * dt).expand(6))
-
-    def sample(*explore: bool) -> tuple[Tensor, Tensor]:
-        _, latent, log_prob = flow.sample(velocity, x0, eps[:, None], torch.tensor(explore))
-        return latent["path"][:, 1], log_prob
-
-    x, log_prob = sample(*[False] * 6)
-    assert torch.equal(x, stock) and not log_prob.any()
     some = torch.tensor([True, False, False, True, False, True])
-    (mixed, mixed_log_prob), (exploring, exploring_log_prob) = sample(*some), sample(*[True] * 6)
-    assert torch.equal(mixed[~some], stock[~some]) and torch.equal(mixed[some], exploring[some])
-    assert torch.equal(mixed_log_prob[some], exploring_log_prob[some])
-    assert not mixed_log_prob[~some].any()
-    assert not torch.isclose(exploring[:, :2, :2], stock[:, :2, :2]).any()
+    action = family.sample(velocity, x0, eps[:, None], some)
+    x = action.latent["path"][:, 1]
+    assert torch.equal(x[~some], stock[~some]) and not action.log_prob[~some].any()
+    assert torch.equal(action.chunk, x[:, :2, :2])
+    assert_close(x[some], (stock + 0.3 * eps)[some])
+    expected = -0.5 * eps.square() - math.log(0.3 * math.sqrt(2 * math.pi))
+    assert_close(action.log_prob[some], expected[some, :2, :2].sum(2))
+    assert_close(family.log_prob(velocity, action.latent)[some], action.log_prob[some])

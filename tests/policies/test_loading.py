@@ -9,23 +9,23 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from pydoc import locate
 from typing import Any
 
 import pytest
 import torch
+from huggingface_hub import constants
+from lerobot.policies.act.modeling_act import ACTPolicy
 from safetensors.torch import load_file, save_file
+from transformers import dynamic_module_utils
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, displaced, save_checkpoint
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.deferred import OURS
 from accerl_lerobot.policies.loading import (
     dry_run_config,
-    load_adapter,
     load_lerobot_config,
     pinned,
     precision_on,
@@ -48,17 +48,14 @@ def damaged(written: Callable[[str], Path], tmp_path: Path) -> Callable[[str], P
 
 
 def saved(path: Path, directory: Path, **options: object) -> Path:
-    config = PolicyConfig(path=str(path), device="cpu", **options)
-    adapter = load_adapter(config)
+    adapter = adapter_at(path, **options)
     perturb(adapter, 0.1)
     adapter.save(directory)
     return directory
 
 
-def decided(path: Path | str, **options: object) -> bytes:
-    return pickle.dumps(
-        load_adapter(PolicyConfig(path=str(path), device="cpu", **options)).decide(requests(3), 0)
-    )
+def decided(path: Path | str) -> bytes:
+    return pickle.dumps(adapter_at(path).decide(requests(3), 0))
 
 
 def edit_weights(path: Path, edit: Callable[[Tensors], object]) -> None:
@@ -67,18 +64,11 @@ def edit_weights(path: Path, edit: Callable[[Tensors], object]) -> None:
     save_file(changed if isinstance(changed, dict) else tensors, path / "model.safetensors")
 
 
-@pytest.mark.parametrize(
-    ("path", "sentence"),
-    [
-        (None, "policy.path=None: give a LeRobot checkpoint directory or Hub id"),
-        ("./nowhere", "policy.path='./nowhere': no config.json there"),
-        ("no/thing", "policy.path='no/thing': not a directory here and not loadable from the Hub"),
-    ],
-)
-def test_a_path_to_nothing(path: str | None, sentence: str):
-    with pytest.raises(InputError) as caught:
-        load_lerobot_config(PolicyConfig(path=path))
-    assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
+def test_a_path_to_nothing():
+    refused("./nowhere", "^policy.path='./nowhere': no config.json there; give the folder named pretrained")
+    refused("no/thing", "^policy.path='no/thing': not a directory here and not loadable from the Hub")
+    with pytest.raises(InputError, match="^policy.path=None: give a LeRobot checkpoint directory or Hub id"):
+        load_lerobot_config(PolicyConfig())
 
 
 @pytest.mark.parametrize(
@@ -87,14 +77,11 @@ def test_a_path_to_nothing(path: str | None, sentence: str):
         ('{"type": "act", "no_such_field": 1}', "its config.json is not one of this LeRobot's policies"),
         ("[1, 2]", "config.json: a mapping is wanted, not list"),
         ("not json", "config.json: not good JSON"),
-        (None, "no config.json there; give the folder named pretrained_model"),
     ],
 )
-def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
+def test_a_config_of_something_else(damaged: Any, text: str, why: str):
     path = damaged("act")
-    (path / "config.json").unlink()
-    if text is not None:
-        (path / "config.json").write_text(text)
+    (path / "config.json").write_text(text)
     refused(path, f"^policy.path=.*{why}")
 
 
@@ -113,9 +100,7 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
         ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian or chunk_n"),
     ],
 )  # fmt: skip
-def test_options_under_which_its_density_would_be_another(
-    damaged: Any, name: str, changes: dict, options: dict, sentence: str
-):
+def test_options_of_another_density(damaged: Any, name: str, changes: dict, options: dict, sentence: str):
     path = damaged(name)
     edit_config(path, **changes)
     refused(path, f"^{sentence}", **options)
@@ -125,9 +110,8 @@ def test_devices(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     assert resolve_device("auto") == resolve_device("cpu") == torch.device("cpu")
-    for name in ("cuda", "cuda:1"):
-        with pytest.raises(InputError, match=f"^policy.device='{name}': no CUDA"):
-            resolve_device(name)
+    with pytest.raises(InputError, match="^policy.device='cuda': no CUDA"):
+        resolve_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     assert resolve_device("auto") == torch.device("cuda")
@@ -135,14 +119,12 @@ def test_devices(monkeypatch: pytest.MonkeyPatch):
         resolve_device("cuda:1")
 
 
-@pytest.mark.parametrize(("here", "emulated"), [(False, True), (True, False)])
-def test_auto_is_bf16_where_the_gpu_itself_computes_in_it(here: bool, emulated: bool, monkeypatch: Any):
-    def supported(including_emulation: bool = True) -> bool:
-        return here or (emulated and including_emulation)
-
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
-    assert precision_on(torch.device("cuda"), "auto") == ("bf16" if here else "fp32")
-    assert precision_on(torch.device("cuda"), "bf16") == "bf16"
+@pytest.mark.parametrize(("here", "precision"), [(False, "fp32"), (True, "bf16")])
+def test_auto_is_bf16_where_the_gpu_itself_computes_in_it(here: bool, precision: str, monkeypatch: Any):
+    monkeypatch.setattr(
+        torch.cuda, "is_bf16_supported", lambda including_emulation=True: here or including_emulation
+    )
+    assert precision_on(torch.device("cuda"), "auto") == precision
 
 
 def test_a_smolvla_is_float32_and_its_backbone_s_weights_are_not_read(tmp_path: Path):
@@ -153,54 +135,44 @@ def test_a_smolvla_is_float32_and_its_backbone_s_weights_are_not_read(tmp_path: 
     backbone["text_config"]["dtype"] = "bfloat16"
     text.write_text(json.dumps(backbone))
     edit_config(path, load_vlm_weights=True, compile_model=True)
-    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    adapter = adapter_at(path)
     assert {parameter.dtype for parameter in adapter.policy.parameters()} == {torch.float32}
     assert adapter.policy.config.load_vlm_weights and not adapter.policy.config.compile_model
 
 
 OUT = "model.action_out_proj.weight"
-EXPERT = "model.paligemma_with_expert.gemma_expert."
-PALI = "model.paligemma_with_expert.paligemma."
-EMBEDDING, HEAD = f"{PALI}model.language_model.embed_tokens.weight", f"{PALI}lm_head.weight"
-
-
-MISSING = r"1 missing \['{key}'\]; config.json and"
 
 
 @pytest.mark.parametrize(
-    ("name", "key", "damage", "detail"),
+    ("name", "damage", "detail"),
     [
-        ("pi0", OUT, lambda t: t.pop(OUT), MISSING),  # LeRobot prints it, and returns a random π0
-        ("pi0", OUT, lambda t: t.update(x=torch.zeros(2)), r"1 unexpected \['model.x'\]"),
-        ("smolvla", OUT, lambda t: t.update({OUT: torch.zeros(3, 3)}), r"1 of another shape \['{key}'\]"),
-        ("smolvla", OUT, lambda t: t[OUT].view(-1)[0].fill_(torch.nan), "{key} holds NaN or infinity"),
+        # LeRobot prints it, and returns a random π0.
+        ("pi0", lambda t: t.pop(OUT), rf"1 missing \['{OUT}'\]; config.json and"),
+        ("pi0", lambda t: t.update(x=torch.zeros(2)), r"1 unexpected \['model.x'\]"),
+        ("smolvla", lambda t: t.update({OUT: torch.zeros(3, 3)}), rf"1 of another shape \['{OUT}'\]"),
+        ("smolvla", lambda t: t[OUT].view(-1)[0].fill_(torch.nan), f"{OUT} holds NaN or infinity"),
     ],
 )
-def test_weights_that_did_not_load_are_named(
-    damaged: Any, name: str, key: str, damage: Callable[..., object], detail: str
-):
+def test_weights_that_did_not_load_are_named(damaged: Any, name: str, damage: Any, detail: str):
     path = damaged(name)
     edit_weights(path, damage)
-    refused(path, f"^policy.path=.*: .*{detail.replace('{key}', key)}")
+    refused(path, f"^policy.path=.*: .*{detail}")
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_output_layers_that_no_action_is_computed_with_may_be_left_out(damaged: Any, name: str):
-    path = damaged(name)
-    expected = decided(path)
-    edit_weights(path, lambda t: [t.pop(k) for k in (HEAD, f"{EXPERT}lm_head.weight")])
-    assert decided(path) == expected
+def test_pi0_s_output_layers_may_be_left_out_and_openpi_s_names_are_read(damaged: Any, name: str):
+    both = "model.paligemma_with_expert."
+    head = f"{both}paligemma.lm_head.weight"
 
-
-@pytest.mark.parametrize("name", KINDS)
-def test_openpi_s_names_are_read_as_lerobot_reads_them(damaged: Any, name: str):
-    # Without the leading ``model.``, the input embedding under the name of the output layer.
     def as_openpi(tensors: Tensors) -> Tensors:
-        tensors[HEAD] = tensors.pop(EMBEDDING)
+        # Without the leading ``model.``, the input embedding under the name of the output layer.
+        tensors[head] = tensors.pop(f"{both}paligemma.model.language_model.embed_tokens.weight")
         return {k.removeprefix("model."): v for k, v in tensors.items()}
 
     path = damaged(name)
     expected = decided(path)
+    edit_weights(path, lambda t: [t.pop(k) for k in (head, f"{both}gemma_expert.lm_head.weight")])
+    assert decided(path) == expected
     edit_weights(path, as_openpi)
     assert decided(path) == expected
     edit_weights(path, lambda t: t.pop("action_in_proj.bias"))
@@ -214,25 +186,16 @@ def test_missing_processors(damaged: Any):
     assert locate("lerobot.processor.migrate_policy_normalization") is not None
 
 
-def test_torchvision_s_weights_are_not_asked_for(
-    damaged: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    from lerobot.policies.factory import get_policy_class
-
-    def download(*arguments: object, **options: object) -> None:
-        raise AssertionError("the network")
-
-    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", download)
-    path, stock = damaged("act"), get_policy_class("act")
+def test_torchvision_s_weights_are_not_asked_for(damaged: Any, tmp_path: Path, monkeypatch: Any):
+    monkeypatch.delattr("torchvision.models._api.load_state_dict_from_url")  # which asks the network
+    path = damaged("act")
     edit_config(path, pretrained_backbone_weights="ResNet18_Weights.IMAGENET1K_V1")
-    with pytest.raises(AssertionError, match="the network"):
-        stock.from_pretrained(path)
-    stock.from_pretrained(saved(path, tmp_path / "saved"))
+    with pytest.raises(NameError):
+        ACTPolicy.from_pretrained(path)
+    ACTPolicy.from_pretrained(saved(path, tmp_path / "saved"))
 
 
 def test_a_changed_lerobot_fails_at_load(written: Any, monkeypatch: pytest.MonkeyPatch):
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
     stock = ACTPolicy.predict_action_chunk
     monkeypatch.setattr(ACTPolicy, "predict_action_chunk", lambda self, batch: stock(self, batch) + 1)
     refused(written("act"), "^policy.type=.*does not fit LeRobot .*: it differs from LeRobot's sampler by")
@@ -240,40 +203,31 @@ def test_a_changed_lerobot_fails_at_load(written: Any, monkeypatch: pytest.Monke
 
 def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path):
     origin = write_smolvla(tmp_path / "origin" / PRETRAINED)
-    adapter = adapter_at(origin)
-    perturb(adapter, 0.1)
 
     def write(directory: Path) -> int:
-        adapter.save(directory / PRETRAINED)
+        saved(origin, directory / PRETRAINED)
         return 12
 
-    final = save_checkpoint(tmp_path / "run" / "checkpoints", write)
+    final = save_checkpoint(tmp_path / "run", write)
+    assert not displaced(final / PRETRAINED)
+    expected = decided(final / PRETRAINED)
     shutil.rmtree(f"{origin}-backbone")
     refused(origin, rf"^policy.path=.*{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/")
     shutil.rmtree(tmp_path / "origin")
-    expected = pickle.dumps(adapter.decide(requests(3), 0))
-    assert decided(final / PRETRAINED) == expected
     moved = Path(shutil.move(final, tmp_path / "elsewhere")) / PRETRAINED
-    shutil.rmtree(tmp_path / "run")
     assert decided(moved) == expected
     second = saved(moved, tmp_path / "second")
     shutil.rmtree(moved)
     assert len(adapter_at(second).decide(requests(1), 0)) == 1, "and so does a checkpoint of the moved one"
 
 
-def test_a_checkpoint_on_the_hub_is_loaded_whole(
-    written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    # Critic and backbone must come along.
-    from huggingface_hub import constants
-
+def test_a_checkpoint_on_the_hub_is_loaded_whole(written: Any, tmp_path: Path, monkeypatch: Any):
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     path = saved(written("smolvla"), cached_repo(tmp_path / "hub", "me/policy", "abc"))
     edit_config(path, vlm_model_name="/on/another/machine")
-    assert decided("me/policy") == decided(path)
+    assert decided("me/policy") == decided(path), "critic and backbone must come along"
     assert pinned(PolicyConfig(path="me/policy")).revision == "abc"
-    with pytest.raises(InputError, match="not loadable from the Hub"):
-        load_adapter(PolicyConfig(path="me/policy", revision="v9", device="cpu"))
+    refused("me/policy", "not loadable from the Hub", revision="v9")
 
 
 def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
@@ -282,41 +236,24 @@ def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
     assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 2, 5)
 
 
-def test_names_of_the_environment_s_features_are_mapped(written: Any):
-    path, request = written("smolvla"), requests(1)[0]
-    adapter = adapter_at(path, rename_map={"observation.images.top": "observation.images.front"})
-    observed, _ = stack_observations(adapter.example_requests())
-    assert observed.keys() == {"observation.images.top", "observation.state"}
-    renamed = {k.replace("front", "top"): v for k, v in request.observation.items()}
-    decision = adapter.decide([replace(request, observation=renamed)], 0)
-    assert pickle.dumps(decision) == pickle.dumps(adapter_at(path).decide([request], 0))
-
-
 @pytest.mark.parametrize("renames", [{}, {"observation.images.front": "observation.images.camera1"}])
 def test_inputs_of_the_base_policy_in_the_config_give_way_to_the_statistics(renames: dict, tmp_path: Path):
     """LeRobot keeps the base policy's: states of six numbers, three cameras."""
-    from lerobot.configs.types import FeatureType, PolicyFeature
-
     camera = next(iter(renames.values()), "observation.images.camera1")
     stats = {next(iter(renames), camera): {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}}
     path = write_smolvla(tmp_path / "policy", camera=camera, max_state_dim=8, stats=stats)
-    config = json.loads((path / "config.json").read_text())
-    inputs = config["input_features"]
+    inputs = json.loads((path / "config.json").read_text())["input_features"]
     inputs |= {f"observation.images.camera{i}": inputs[camera] for i in (2, 3)}
     inputs["observation.state"]["shape"] = [6]
-    (path / "config.json").write_text(json.dumps(config))
+    edit_config(path, input_features=inputs)
     steps = json.loads((path / PROCESSOR).read_text())
     steps["steps"][0]["config"]["rename_map"] = renames
     (path / PROCESSOR).write_text(json.dumps(steps))
 
-    features = {
-        camera: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (4,)),
-    }
-    assert load_lerobot_config(PolicyConfig(path=str(path), device="cpu")).input_features == features
-    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
-    adapter.save(tmp_path / "saved")
-    stored = json.loads((tmp_path / "saved/config.json").read_text())["input_features"]
+    for folder in (path, saved(path, tmp_path / "saved")):
+        features = load_lerobot_config(PolicyConfig(path=str(folder), device="cpu")).input_features
+        assert {k: f.shape for k, f in features.items()} == {camera: (3, 32, 32), "observation.state": (4,)}
+    stored = json.loads((tmp_path / "saved" / "config.json").read_text())["input_features"]
     assert stored.keys() == features.keys() and stored["observation.state"]["shape"] == [4]
 
 
@@ -342,8 +279,6 @@ class UniversalActionProcessor:
 
 def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Puts code into the Hub repository of FAST's tokeniser; it leaves a mark when it is run."""
-    from transformers import dynamic_module_utils
-
     snapshot = cached_repo(cache, ACTIONS, COMMIT)
     marker = cache / "was-run"
     (snapshot / "processing_action_tokenizer.py").write_text(REMOTE_CODE.format(marker=str(marker)))
@@ -351,25 +286,9 @@ def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return marker
 
 
-def named(path: Path) -> set[str]:
-    """Names of tokenisers in a checkpoint's files."""
-    config = json.loads((path / "config.json").read_text())
-    steps = json.loads((path / PROCESSOR).read_text())["steps"]
-    options = {s.get("registry_name"): s["config"] for s in steps}
-    return {
-        config.get("text_tokenizer_name", PALIGEMMA),
-        config.get("action_tokenizer_name", ACTIONS),
-        options["tokenizer_processor"]["tokenizer_name"],
-        options.get("action_tokenizer_processor", {}).get("action_tokenizer_name", ACTIONS),
-    }
-
-
 @pytest.mark.parametrize("name", ["pi0", "pi0_fast"])
-def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(name: str, tmp_path: Path, monkeypatch: Any):
     original = write_pi(tmp_path / "original", name, num_steps=8, whole=False)
-    assert not (original / BACKBONE).exists()
     refused(original, "^policy.path=.*its LeRobot processors did not load")
     with hub(tmp_path / "original-hub"):
         marker = remote(tmp_path / "original-hub", monkeypatch)
@@ -379,21 +298,20 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
     adapter.save(tmp_path / "ours")
     for folder in (original, tmp_path / "original-hub"):
         shutil.rmtree(folder)
-    moved = Path(shutil.move(tmp_path / "ours", tmp_path / "moved"))
-    expected = pickle.dumps(adapter.decide(requests(3), 0))
-    assert decided(moved) == expected
-    adapter_at(moved).save(tmp_path / "second")
-    shutil.rmtree(moved)
-    assert decided(tmp_path / "second") == expected
-    assert named(tmp_path / "second") == {PALIGEMMA, ACTIONS}, "others find them where the original's were"
+    adapter_at(tmp_path / "ours").save(tmp_path / "second")
+    shutil.rmtree(tmp_path / "ours")
+    assert decided(tmp_path / "second") == pickle.dumps(adapter.decide(requests(3), 0))
+    content = "".join((tmp_path / "second" / file).read_text() for file in ("config.json", PROCESSOR))
+    assert str(tmp_path) not in content, "others find the tokenisers where the original's were"
+    assert PALIGEMMA in content and (ACTIONS in content) == (name == "pi0_fast")
     assert not displaced(tmp_path / "second")
 
 
-def rename_statistics(path: Path, which: str = "*normalizer", old: str = "", new: str = "so100.") -> None:
-    """Puts `new` in the place of the `old` beginning of the statistics' names, of one kind or both."""
+def rename_statistics(path: Path, which: str = "*normalizer", old: str = "") -> None:
+    """Puts ``so100.`` in the place of the `old` beginning of the statistics' names, of one kind or both."""
     for file in path.glob(f"*_{which}_processor.safetensors"):
         state = load_file(file)
-        save_file({re.sub(f"^{old}", new, name): value for name, value in state.items()}, file)
+        save_file({re.sub(f"^{old}", "so100.", name): value for name, value in state.items()}, file)
 
 
 @pytest.mark.parametrize(
@@ -403,9 +321,7 @@ def rename_statistics(path: Path, which: str = "*normalizer", old: str = "", new
         ("unnormalizer", "action: no mean and std of it, .*it has so100"),
     ],
 )
-def test_statistics_of_other_names_are_refused_unless_it_is_to_be_fine_tuned(
-    damaged: Any, which: str, why: str
-):
+def test_statistics_of_other_names_are_refused_unless_it_is_fine_tuned(damaged: Any, which: str, why: str):
     path = damaged("smolvla")
     rename_statistics(path, which)
     config = PolicyConfig(path=str(path), device="cpu")
@@ -438,7 +354,6 @@ def test_pictures_that_were_never_normalised_are_accepted_with_a_warning(damaged
     adapter_at(path)
     (warning,) = [record.getMessage() for record in caplog.records]
     assert "observation.images.front: no mean and std of it" in warning
-    assert "pictures go in as they are" in warning
 
 
 CODE = """
@@ -447,13 +362,9 @@ from accerl_lerobot.policies.config import PolicyConfig, register_policies
 from accerl_lerobot.policies.loading import load_adapter
 
 load_adapter(PolicyConfig(path=sys.argv[1], device="cpu"))  # as trainer and inference begin
-loaded = [n for n in ("smolvla", "act", "groot") if f"lerobot.policies.{n}.processor_{n}" in sys.modules]
-assert loaded == ["smolvla"], loaded
+assert "lerobot.policies.groot.processor_groot" not in sys.modules
 from lerobot.configs.policies import PreTrainedConfig
 assert {"smolvla", "act", "groot"} <= set(PreTrainedConfig.get_known_choices())
-from lerobot.policies.factory import get_policy_class
-from lerobot.policies.act import ACTPolicy
-assert get_policy_class("act") is ACTPolicy
 register_policies("of another package")
 assert "lerobot.policies.groot.processor_groot" in sys.modules
 """

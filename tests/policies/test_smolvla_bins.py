@@ -12,12 +12,13 @@ import lerobot_policy_smolvla_bins  # noqa: F401
 import numpy as np
 import pytest
 import torch
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
-from accerl_lerobot.policies.config import PLUGINS, discovery
+from accerl_lerobot.policies.config import PLUGINS
 from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
@@ -41,28 +42,12 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def loaded(path: Path) -> tuple[Any, Any, Any]:
-    """Policy and processors, by LeRobot alone."""
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
-    policy = get_policy_class("smolvla_bins").from_pretrained(path)
-    return policy, *make_pre_post_processors(policy.config, pretrained_path=str(path))
+def policy(path: Path) -> Any:
+    """By LeRobot alone."""
+    return get_policy_class("smolvla_bins").from_pretrained(path)
 
 
-def observed(count: int, seed: int = 0) -> dict[str, Any]:
-    """A batch as LeRobot's loader makes it; the instructions have unequal lengths."""
-    draw = torch.Generator().manual_seed(seed)
-    return {
-        "observation.images.front": torch.rand(count, 3, 32, 32, generator=draw),
-        "observation.state": torch.randn(count, 4, generator=draw),
-        "task": ["Go", "Match the target", "Mirror the target slowly"][:count],
-        "action": 4 * torch.rand(count, CHUNK, DIMS, generator=draw) - 1,
-        "action_is_pad": torch.tensor([[False] * CHUNK, [False, True, True], [False, False, True]])[:count],
-    }
-
-
-def test_bins_by_hand(loaded: tuple[Any, Any, Any]):
-    policy = loaded[0]
+def test_bins_by_hand(policy: Any):
     actions = torch.tensor([-1.0, -0.751, -0.749, 0.0, 0.999, 1.0, 7.0, -7.0])
     tokens = policy.encode_actions(actions)
     assert tokens.tolist() == [0, 0, 1, 4, 7, 7, 7, 0]
@@ -80,22 +65,25 @@ def test_the_chunk_is_the_tokens_bin_centres_in_the_environment_s_units(path: Pa
     assert short.chunk.shape == (1, DIMS) and short.latent["tokens"].shape == (DIMS,)
 
 
-def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
-    policy, pre, _ = loaded
-    raw = observed(3)
-    batch = pre(raw)
+def test_the_loss_by_hand(policy: Any, path: Path):
+    draw = torch.Generator().manual_seed(0)
+    raw = {  # a batch as LeRobot's loader makes it; the instructions have unequal lengths
+        "observation.images.front": torch.rand(3, 3, 32, 32, generator=draw),
+        "observation.state": torch.randn(3, 4, generator=draw),
+        "task": ["Go", "Match the target", "Mirror the target slowly"],
+        "action": 4 * torch.rand(3, CHUNK, DIMS, generator=draw) - 1,
+        "action_is_pad": torch.tensor([[False] * CHUNK, [False, True, True], [False, False, True]]),
+    }
+    batch = make_pre_post_processors(policy.config, pretrained_path=str(path))[0](raw)
     assert_close(batch["action"], (raw["action"] + 1) / 2 - 1)  # [-1, 3] became [-1, 1]
     with torch.no_grad():
         logits = policy.model.logits(policy.hidden(batch)).view(3, CHUNK, DIMS, BINS).double().numpy()
     sums = np.zeros(3)
-    for b in range(3):
-        for k in range(CHUNK):
-            for a in range(DIMS):
-                if raw["action_is_pad"][b, k]:
-                    continue
-                wanted = min(int((float(raw["action"][b, k, a]) + 1) / 4 * BINS), BINS - 1)
-                row = logits[b, k, a]
-                sums[b] += np.log(np.exp(row).sum()) - row[wanted]
+    for b, k, a in np.ndindex(3, CHUNK, DIMS):
+        if not raw["action_is_pad"][b, k]:
+            wanted = min(int((float(raw["action"][b, k, a]) + 1) / 4 * BINS), BINS - 1)
+            row = logits[b, k, a]
+            sums[b] += np.log(np.exp(row).sum()) - row[wanted]
     counts = DIMS * np.array([3, 1, 2])
     loss, info = policy.forward(batch)
     assert loss.item() == pytest.approx(sums.sum() / counts.sum(), rel=1e-4)
@@ -108,46 +96,28 @@ def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
 
 def test_lerobot_is_told_where_the_type_is(path: Path, tmp_path: Path):
     flag = f"--policy.discover_packages_path={PLUGINS['smolvla_bins']}"
-    assert discovery("smolvla_bins") == [flag] and discovery("smolvla") == discovery(None) == []
-    new = sft_command(SFT, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
-    assert flag in new and "--policy.type=smolvla_bins" in new
-    further = SFTConfig(steps=1, init_path=str(path))
-    assert flag in sft_command(further, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
-    assert flag not in sft_command(
-        SFTConfig(steps=1), DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu"
-    )
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, float]]]:
-    """A checkpoint of LeRobot's own trainer, in a process of its own, and its loss on the way."""
-    losses: list[tuple[int, float]] = []
-    output = tmp_path_factory.mktemp("sft") / "sft"
-    dataset = DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(DATASET))
-    path = run_sft(
-        SFT, dataset, output, seed=0, texts=["Open a drawer"],
-        on_step=lambda step, loss: losses.append((step, loss)),
-    )  # fmt: skip
-    return path, losses
+    for sft, there in ((SFT, True), (SFTConfig(init_path=str(path)), True), (SFTConfig(), False)):
+        command = sft_command(sft, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
+        assert (flag in command) == there
 
 
 @pytest.mark.slow
-def test_lerobot_s_trainer_lowers_the_loss(trained: tuple[Path, list[tuple[int, float]]]):
-    path, losses = trained
-    assert [step for step, _ in losses] == [10, 20, 30, 40, 50, 60]
-    assert losses[-1][1] < losses[0][1] - 0.3 and losses[-1][1] < np.log(32) - 0.5  # log 32: knows nothing
+def test_lerobot_s_trainer_lowers_the_loss_and_lerobot_eval_runs_the_checkpoint(tmp_path: Path):
+    losses: list[float] = []
+    dataset = DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(DATASET))
+    path = run_sft(
+        SFT, dataset, tmp_path / "sft", seed=0, texts=["Open a drawer"],
+        on_step=lambda step, loss: losses.append(loss),
+    )  # fmt: skip
+    assert losses[-1] < losses[0] - 0.3 and losses[-1] < np.log(32) - 0.5  # log 32: knows nothing
     adapter = adapter_at(path)
     assert adapter.family.model.length == 12
     stats = json.loads((DATASET / "meta" / "stats.json").read_text())["action"]
     ends = torch.tensor([-1.0, 1.0])[:, None, None].expand(2, 1, 4)
     assert_close(adapter.processing.unnormalise(ends)[:, 0], [stats["min"], stats["max"]])
-
-
-@pytest.mark.slow
-def test_lerobot_eval_runs_the_checkpoint(trained: tuple[Path, list[tuple[int, float]]], tmp_path: Path):
     command = [
-        sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={trained[0]}",
-        *discovery("smolvla_bins"), "--policy.device=cpu",
+        sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={path}",
+        f"--policy.discover_packages_path={PLUGINS['smolvla_bins']}", "--policy.device=cpu",
         "--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin", "--env.type=accerl",
         "--env.environment={type: metaworld, task: drawer-open-v3, image_size: 64, max_steps: 8}",
         "--eval.n_episodes=2", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}",

@@ -14,31 +14,26 @@ from torch import Tensor
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import tokens as tk
 from accerl_lerobot.policies.config import TokenSamplerConfig
-from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.tokens import TokenContext, TokenFamily, TokenModel
+from accerl_lerobot.policies.family import Action, Encoded
+from accerl_lerobot.policies.tokens import TokenContext, TokenFamily
 from tests.rounding import assert_close
 
 VOCABULARY, LENGTH, WIDTH = 4, 3, 5
 END = 3
+COUNT = 20_000
 
 
-class Recurrent(TokenModel):
+class Recurrent:
     """Autoregressive: h ← tanh(h + E[token]), logits = U h; the observation is the first h."""
 
-    terminator, length, width = END, LENGTH, WIDTH
+    terminator, length = END, LENGTH
 
     def __init__(self, perturbation: float = 0.0) -> None:
         draw = torch.Generator().manual_seed(1)
-        self.embedding = torch.randn(VOCABULARY, WIDTH, generator=draw)
-        self.out = torch.randn(VOCABULARY, WIDTH, generator=draw)
-        self.decoder = torch.randn(LENGTH, VOCABULARY, 2, generator=draw)
-        self.out += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
-        self.embedding += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
+        weights, moved = torch.randn(2, 2, VOCABULARY, WIDTH, generator=draw)
+        self.embedding, self.out = weights + perturbation * moved
 
-    def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        start = batch["observation"]
-        mask = torch.ones(len(start), 1, dtype=torch.bool)
-
+    def context(self, start: Tensor) -> TokenContext:
         def logits(tokens: Tensor) -> Tensor:
             h, rows = start, []
             for position in range(tokens.shape[1]):
@@ -50,130 +45,97 @@ class Recurrent(TokenModel):
             h = start
             for position in range(LENGTH):
                 chosen = choose(h @ self.out.T, position)
-                assert chosen.dtype == torch.int64
                 if (chosen == END).all():
                     break
                 h = torch.tanh(h + self.embedding[chosen])
 
-        context = TokenContext(logits=logits, generate=generate)
-        return Encoded(features=start[:, None], mask=mask, context=context)
+        return TokenContext(logits=logits, generate=generate)
 
-    def chunk(self, tokens: Tensor) -> Tensor:
-        """One action that hangs on all tokens and on where the terminator is."""
-        return sum(self.decoder[i, tokens[:, i]] for i in range(LENGTH))[:, None]
-
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        rows = []
-        for start in batch["observation"]:
-            said = _greedy(self, start.numpy().astype(np.float64))
-            rows.append(self.chunk(torch.tensor([said]))[0])
-        return torch.stack(rows)
-
-
-class Parallel(TokenModel):
-    """All logits at once, from the observation alone."""
-
-    terminator, length, width = None, LENGTH, WIDTH
-
-    def __init__(self, perturbation: float = 0.0) -> None:
-        draw = torch.Generator().manual_seed(2)
-        self.out = torch.randn(LENGTH, VOCABULARY, WIDTH, generator=draw)
-        self.out += perturbation * torch.randn(LENGTH, VOCABULARY, WIDTH, generator=draw)
-
-    def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        start = batch["observation"]
-        logits = torch.einsum("bw,lvw->blv", start, self.out)
-        mask = torch.ones(len(start), 1, dtype=torch.bool)
-        return Encoded(features=start[:, None], mask=mask, context=TokenContext(logits=lambda tokens: logits))
+    def slow_logits(self, start: np.ndarray, said: tuple[int, ...]) -> np.ndarray:
+        """Logits (V,) of position ``len(said)``, in double precision."""
+        h = start
+        for token in said:
+            h = np.tanh(h + self.embedding[token].double().numpy())
+        return self.out.double().numpy() @ h
 
     def chunk(self, tokens: Tensor) -> Tensor:
         return (tokens / VOCABULARY)[..., None]
 
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        return self.chunk(torch.einsum("bw,lvw->blv", batch["observation"], self.out).argmax(-1))
 
+class Parallel(Recurrent):
+    """All logits at once, from the observation alone."""
 
-def slow_logits(model: Any, start: np.ndarray, said: tuple[int, ...]) -> np.ndarray:
-    """Logits (V,) of position ``len(said)``, in double precision."""
-    if isinstance(model, Parallel):
-        return model.out[len(said)].double().numpy() @ start
-    h = start
-    for token in said:
-        h = np.tanh(h + model.embedding[token].double().numpy())
-    return model.out.double().numpy() @ h
+    terminator = None
 
+    def __init__(self, perturbation: float = 0.0) -> None:
+        draw = torch.Generator().manual_seed(2)
+        weights, moved = torch.randn(2, LENGTH, VOCABULARY, WIDTH, generator=draw)
+        self.out = weights + perturbation * moved
 
-def slow_probabilities(
-    model: Any, start: np.ndarray, said: tuple[int, ...], temperature: float
-) -> list[float]:
-    weights = [math.exp(x / temperature) for x in slow_logits(model, start, said)]
-    return [w / sum(weights) for w in weights]
+    def context(self, start: Tensor) -> TokenContext:
+        logits = torch.einsum("bw,lvw->blv", start, self.out)
+        return TokenContext(logits=lambda tokens: logits)
 
-
-def _greedy(model: Any, start: np.ndarray) -> list[int]:
-    said: tuple[int, ...] = ()
-    while len(said) < LENGTH:
-        ended = model.terminator is not None and model.terminator in said
-        said += (END if ended else int(np.argmax(slow_logits(model, start, said))),)
-    return list(said)
+    def slow_logits(self, start: np.ndarray, said: tuple[int, ...]) -> np.ndarray:
+        return self.out[len(said)].double().numpy() @ start
 
 
 def sequences(model: Any) -> list[tuple[int, ...]]:
     """All that the model can say, the terminator to the end after the first."""
     every = itertools.product(range(VOCABULARY), repeat=LENGTH)
-    if model.terminator is None:
-        return list(every)
-    return [s for s in every if all(b == END for a, b in itertools.pairwise(s) if a == END)]
+    return [s for s in every if all(b == END for a, b in itertools.pairwise(s) if a == model.terminator)]
 
 
-def oracle(
-    model: Any, start: np.ndarray, said: tuple[int, ...], temperature: float
-) -> tuple[list, float, list]:
+def oracle(model: Any, said: tuple[int, ...], temperature: float) -> tuple[list, float, list]:
     """Log-probs (L,), entropy and factors (L,) of one sequence."""
     log_probs, entropy, exists = [], 0.0, []
     for position in range(LENGTH):
-        exists.append(model.terminator is None or model.terminator not in said[:position])
-        if not exists[-1]:
-            log_probs.append(0.0)
-            continue
-        p = slow_probabilities(model, start, said[:position], temperature)
-        log_probs.append(math.log(p[said[position]]))
-        entropy -= sum(x * math.log(x) for x in p)
+        exists.append(model.terminator not in said[:position])
+        weights = np.exp(model.slow_logits(START[0].double().numpy(), said[:position]) / temperature)
+        p = weights / weights.sum()
+        log_probs.append(exists[-1] * math.log(p[said[position]]))
+        entropy -= exists[-1] * float(p @ np.log(p))
     return log_probs, entropy, exists
 
 
-def observations(count: int, seed: int = 0) -> Tensor:
-    return torch.randn(count, WIDTH, generator=torch.Generator().manual_seed(seed))
+def probabilities(model: Any, temperature: float = 1.0) -> list[float]:
+    """Those of `sequences`."""
+    return [math.exp(sum(oracle(model, said, temperature)[0])) for said in sequences(model)]
 
 
-def requests(count: int, explore: bool = True, first: int = 0) -> list[Request]:
-    return [Request(observation={}, noise_seed=first + i, explore=explore) for i in range(count)]
+START = torch.randn(1, WIDTH, generator=torch.Generator().manual_seed(0))  # the observation
+
+
+def encoded(model: Any, count: int) -> Encoded:
+    starts = START.expand(count, -1)
+    mask = torch.ones(count, 1, dtype=torch.bool)
+    return Encoded(features=starts[:, None], mask=mask, context=model.context(starts))
 
 
 def family(model: Any, temperature: float = 1.0) -> TokenFamily:
     return TokenFamily(model, TokenSamplerConfig(temperature=temperature))
 
 
-def encoded(model: Any, starts: Tensor) -> Encoded:
-    return model.encode({"observation": starts})
+def act(model: Any, temperature: float = 1.0) -> Action:
+    asked = [Request(observation={}, noise_seed=i) for i in range(COUNT)]
+    return family(model, temperature).act(encoded(model, COUNT), asked)
 
 
-MODELS = [Recurrent, Parallel]
+KINDS = pytest.mark.parametrize("kind", [Recurrent, Parallel])
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.5, 3.0])
-@pytest.mark.parametrize("kind", MODELS)
+@KINDS
 def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature: float):
     model = kind()
     said = sequences(model)
-    start = observations(1)
-    tokens_family, latent = family(model, temperature), {"tokens": torch.tensor(said)}
-    log_prob, entropy = tokens_family.score(encoded(model, start.expand(len(said), -1)), latent)
-    factors = tokens_family.factors(latent)
-    expected = [oracle(model, start[0].double().numpy(), s, temperature) for s in said]
+    latent = {"tokens": torch.tensor(said)}
+    log_prob, entropy = family(model, temperature).score(encoded(model, len(said)), latent)
+    expected = [oracle(model, s, temperature) for s in said]
     assert_close(log_prob, [e[0] for e in expected])
     assert_close(entropy, [e[1] for e in expected])
     assert log_prob.sum(1).exp().sum() == pytest.approx(1.0, abs=1e-4), "a density over them"
+    factors = family(model).factors(latent)
     if kind is Recurrent:
         assert factors is not None and factors.tolist() == [e[2] for e in expected]
         assert not factors.all()
@@ -182,44 +144,35 @@ def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.4, 3.0])
-@pytest.mark.parametrize("kind", MODELS)
+@KINDS
 def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: float):
-    model, start, count = kind(), observations(1), 20_000
-    read = encoded(model, start.expand(count, -1))
-    action = family(model, temperature).act(read, requests(count))
-    seen = Counter(map(tuple, action.latent["tokens"].tolist()))
+    model = kind()
+    seen = Counter(map(tuple, act(model, temperature).latent["tokens"].tolist()))
     said = sequences(model)
     assert seen.keys() <= set(said)
-    squares = 0.0
-    for sequence in said:
-        p = math.exp(sum(oracle(model, start[0].double().numpy(), sequence, temperature)[0]))
-        squares += (seen[sequence] - count * p) ** 2 / (count * p)
+    found, expected = np.array([seen[s] for s in said]), COUNT * np.array(probabilities(model, temperature))
     freedom = len(said) - 1
-    assert squares < freedom + 5 * math.sqrt(2 * freedom), "χ²"
+    assert ((found - expected) ** 2 / expected).sum() < freedom + 5 * math.sqrt(2 * freedom), "χ²"
 
 
-@pytest.mark.parametrize("kind", MODELS)
+@KINDS
 def test_weighted_samples_of_mu_are_samples_of_pi(kind: Any):
-    old, new, start, count = kind(), kind(0.3), observations(1, seed=1), 20_000
-    starts = start.expand(count, -1)
-    action = family(old).act(encoded(old, starts), requests(count))
-    log_prob = family(new).score(encoded(new, starts), action.latent)[0]
+    old, new = kind(), kind(0.3)
+    action = act(old)
+    log_prob = family(new).score(encoded(new, COUNT), action.latent)[0]
     ratio = (log_prob - action.log_prob).sum(1).exp().double()
 
     def payoff(chunk: Tensor) -> Tensor:
         x = chunk.flatten(1).double()
         return torch.tanh(2 * (x[:, 0] - x[:, -1])) + x[:, 0] ** 2
 
-    def exact(model: Any) -> float:
-        said = sequences(model)
-        each = [math.exp(sum(oracle(model, start[0].double().numpy(), s, 1.0)[0])) for s in said]
-        return float(np.dot(each, payoff(old.chunk(torch.tensor(said)))))
-
+    payoffs = payoff(old.chunk(torch.tensor(sequences(old))))
+    of_old, of_new = (float(np.dot(probabilities(model), payoffs)) for model in (old, new))
     product = ratio * payoff(action.chunk)
-    error = float(product.std()) / math.sqrt(count)
-    assert abs(exact(old) - exact(new)) > 10 * error, "the weights must matter, or the test shows nothing"
-    assert abs(float(product.mean()) - exact(new)) < 4 * error
-    assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(count)
+    error = float(product.std()) / math.sqrt(COUNT)
+    assert abs(of_old - of_new) > 10 * error, "the weights must matter, or the test shows nothing"
+    assert abs(float(product.mean()) - of_new) < 4 * error
+    assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(COUNT)
 
 
 def test_impossible_tokens_are_never_drawn_and_spoil_nothing():
@@ -239,12 +192,3 @@ def test_a_large_vocabulary_is_drawn_from_without_rounding():
     place = (torch.arange(50, dtype=torch.float64) + 0.5) / 50
     drawn = tk.draw(torch.zeros(50, size), place, 1.0)
     assert (drawn - (place * size).long()).abs().max() <= 1
-
-
-@pytest.mark.parametrize("kind", MODELS)
-def test_the_self_check_passes_the_most_likely_tokens_and_no_others(kind: Any):
-    model, batch = kind(), {"observation": observations(6)}
-    read, stock = model.encode(batch), model.stock(batch)
-    assert family(model, 2.0).difference(batch, read) == 0.0
-    model.stock = lambda batch: stock + 0.1
-    assert family(model).difference(batch, read) == pytest.approx(0.1, rel=1e-4)

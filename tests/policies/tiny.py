@@ -19,8 +19,7 @@ from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.rollout.runner import ActiveEpisode, EpisodePlan
 
-TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
-"""Texts of different lengths, so that a batch pads some of them."""
+TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")  # a batch pads some of them
 
 
 def requests(count: int, *, explore: bool = True, seed: int = 0, image: int = 32) -> list[Request]:
@@ -41,25 +40,19 @@ def requests(count: int, *, explore: bool = True, seed: int = 0, image: int = 32
 
 def looking_back(count: int, *, explore: bool = True, image: int = 32) -> list[Request]:
     """Requests whose observations hold two env steps, unrelated ones."""
-    return [
-        replace(
-            now,
-            observation={
-                key: value if key == TASK else np.stack([before.observation[key], value])
-                for key, value in now.observation.items()
-            },
-        )
-        for before, now in zip(
-            requests(count, seed=7, image=image), requests(count, explore=explore, image=image), strict=True
-        )
-    ]
+    asked = requests(count, explore=explore, image=image)
+    for i, before in enumerate(requests(count, seed=7, image=image)):
+        now = asked[i].observation
+        seen = {key: np.stack([before.observation[key], now[key]]) for key in now if key != TASK}
+        asked[i] = replace(asked[i], observation=now | seen)
+    return asked
 
 
-def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any) -> LeRobotAdapter:
+def adapter_at(path: Path | str, sampler: SamplerConfig | None = None, **options: Any) -> LeRobotAdapter:
     return load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, **options))
 
 
-def refused(path: Path, why: str, **options: Any) -> None:
+def refused(path: Path | str, why: str, **options: Any) -> None:
     """Asserts that a policy is not loaded, in one line."""
     with pytest.raises(InputError, match=why) as caught:
         adapter_at(path, **options)

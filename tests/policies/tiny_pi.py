@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """π0 and its kin at a tenth of a million parameters, offline.
 
-LeRobot's configs know two sizes of Gemma, 0.3 and 2 billion parameters, and write PaliGemma's vocabulary and
-widths over whatever else they are given. `small` puts other sizes in where LeRobot's modules look theirs up;
-everything else is LeRobot's own code. A policy is built from its config whenever it is loaded, so it must be
-active then, too.
+LeRobot's configs know two sizes of Gemma, 0.3 and 2 billion parameters. `small` puts other sizes in where
+LeRobot's modules look theirs up, whenever a policy is built or loaded; everything else is LeRobot's own code.
 """
 
 import contextlib
@@ -16,6 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from huggingface_hub import constants
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+from transformers import PreTrainedTokenizerFast
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST
 from accerl_lerobot.policies.vla import data_only
@@ -73,9 +75,6 @@ def _shrunk(real: Any) -> Any:
 
 def write_fast(directory: Path) -> Path:
     """A tokeniser of actions in the files that FAST's has: characters, two zeros in one, half a letter."""
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
-    from transformers import PreTrainedTokenizerFast
-
     byte_level = pre_tokenizers.ByteLevel(add_prefix_space=False)
     letters = [byte_level.pre_tokenize_str(chr(i))[0][0] for i in range(CHARACTERS)]
     half = byte_level.pre_tokenize_str("é")[0][0][0]  # decodes to U+FFFD
@@ -92,9 +91,6 @@ def write_fast(directory: Path) -> Path:
 
 def write_tokenizer(directory: Path) -> Path:
     """Bytes, some words, and at the end fillers, which is where PaliGemma has tokens that are no text."""
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-    from transformers import PreTrainedTokenizerFast
-
     raw = Tokenizer(models.BPE())
     raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     trainer = trainers.BpeTrainer(
@@ -105,9 +101,8 @@ def write_tokenizer(directory: Path) -> Path:
     )
     raw.train_from_iterator(TEXTS, trainer)
     learnt = json.loads(raw.to_str())["model"]
-    vocabulary: dict[str, int] = learnt["vocab"]
-    for i in range(len(vocabulary), VOCABULARY):
-        vocabulary[f"<loc{i:04d}>"] = i
+    vocabulary = learnt["vocab"]
+    vocabulary |= {f"<loc{i:04d}>": i for i in range(len(vocabulary), VOCABULARY)}
     full = Tokenizer(models.BPE(vocab=vocabulary, merges=[tuple(pair) for pair in learnt["merges"]]))
     full.pre_tokenizer, full.decoder = raw.pre_tokenizer, decoders.ByteLevel()
     PreTrainedTokenizerFast(
@@ -119,8 +114,6 @@ def write_tokenizer(directory: Path) -> Path:
 @contextlib.contextmanager
 def hub(cache: Path) -> Iterator[None]:
     """A Hub cache that holds both tokenisers, as after a download; nothing else reaches the Hub."""
-    from huggingface_hub import constants
-
     for name, write in ((PALIGEMMA, write_tokenizer), (ACTIONS, write_fast)):
         config = cached_repo(cache, name, COMMIT) / "config.json"
         if not config.exists():
@@ -133,7 +126,7 @@ def hub(cache: Path) -> Iterator[None]:
 
 def write_pi(
     directory: Path, kind: str, *, padded_dim: int = 2, chunk: int = 4, executed: int = 4,
-    num_steps: int = 3, prompt: int = 48, whole: bool = True, **fields: Any,
+    num_steps: int = 3, prompt: int = 48, whole: bool = True, image: int = IMAGE, **fields: Any,
 ) -> Path:  # fmt: skip
     """Saves a random policy with identity-like normalisation as LeRobot does; call it within `small`.
 
@@ -144,7 +137,7 @@ def write_pi(
     cache = directory.parent / f"{directory.name}-hub"
     with hub(cache), data_only():
         write_policy(
-            directory, kind, image=IMAGE, seed=1, prepare=_spread,
+            directory, kind, image=image, seed=1, prepare=_spread,
             chunk_size=chunk, n_action_steps=executed, max_state_dim=4, max_action_dim=padded_dim,
             image_resolution=(IMAGE, IMAGE), tokenizer_max_length=prompt,
             **({"num_inference_steps": num_steps} if kind in KINDS else fast), **fields,
@@ -159,8 +152,6 @@ def write_pi(
 
 def _spread(policy: Any) -> None:
     """Makes the time matter, and action tokens of π0-FAST more likely than others."""
-    import torch
-
     with torch.no_grad():
         for name, parameter in policy.named_parameters():
             if ".dense." in name:  # adaptive norms start at zero, where the time has no effect
