@@ -7,6 +7,7 @@ import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ import torch
 import transformers
 from diffusers import AutoencoderKLWan
 from huggingface_hub import constants
+from safetensors.torch import save_file
 from tokenizers import pre_tokenizers
 
 from tests.hub_cache import cached_repo
@@ -59,14 +61,20 @@ def qwen_vl(folder: Path, text: dict[str, Any], vision: dict[str, Any]) -> tuple
     return config | {"dtype": "float32"}, tokenizer
 
 
+def write_qwen25_vl(folder: Path) -> tuple[dict[str, Any], Any]:
+    """The processor of a tiny Qwen2.5-VL; returns its config and the tokeniser."""
+    vision = {"window_size": 56, "fullatt_block_indexes": [0]}
+    config, tokenizer = qwen_vl(folder, {"max_position_embeddings": 4096}, vision)
+    images = transformers.Qwen2VLImageProcessor(min_pixels=28 * 28, max_pixels=56 * 56)
+    videos = transformers.Qwen2VLVideoProcessor()
+    transformers.Qwen2_5_VLProcessor(images, tokenizer, videos, TEMPLATE).save_pretrained(folder)
+    return config, tokenizer
+
+
 def write_eo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
     """An EO1 on a tiny Qwen2.5-VL."""
     backbone = directory.parent / f"{directory.name}-qwen"
-    vision = {"window_size": 56, "fullatt_block_indexes": [0]}
-    config, tokenizer = qwen_vl(backbone, {"max_position_embeddings": 4096}, vision)
-    images = transformers.Qwen2VLImageProcessor(min_pixels=28 * 28, max_pixels=56 * 56)
-    videos = transformers.Qwen2VLVideoProcessor()
-    transformers.Qwen2_5_VLProcessor(images, tokenizer, videos, TEMPLATE).save_pretrained(backbone)
+    config, _ = write_qwen25_vl(backbone)
     torch.manual_seed(0)
     model = transformers.Qwen2_5_VLForConditionalGeneration(transformers.Qwen2_5_VLConfig(**config))
     model.save_pretrained(backbone)
@@ -153,14 +161,75 @@ def write_molmoact2(directory: Path, *, image: int = 64, **options: Any) -> Path
     return write_policy(directory, "molmoact2", image=image, **(fields | options))
 
 
+def write_wall_x(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A Wall-X on a tiny Qwen2.5-VL with two experts."""
+    from lerobot.policies.wall_x.modeling_wall_x import Qwen2_5_VLMoEForAction
+    from lerobot.policies.wall_x.qwen_model.configuration_qwen2_5_vl import Qwen2_5_VLConfig
+
+    backbone = directory.parent / f"{directory.name}-qwen"
+    config, tokenizer = write_qwen25_vl(backbone)
+    tokenizer.add_special_tokens({"additional_special_tokens": ["<|action|>", "<|propri|>"]})
+    tokenizer.save_pretrained(backbone)
+    expert = SIZES | {"hidden_act": "silu"}
+    config["text_config"] |= {
+        "mlp_moe": True, "num_experts": 2, "experts": [expert, expert], "dim_inputs": [WIDTH, WIDTH],
+        "dof_config": {"joints": 4}, "vocab_size": len(tokenizer),
+    }  # fmt: skip
+    torch.manual_seed(0)
+    qwen = Qwen2_5_VLConfig(agent_pos_config={"joints": 4}, **config)
+    qwen.save_pretrained(backbone)
+    model = Qwen2_5_VLMoEForAction(qwen, processor=SimpleNamespace(tokenizer=tokenizer))
+    save_file(model.state_dict(), backbone / "model.safetensors")
+    fields = {
+        "pretrained_name_or_path": str(backbone), "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 4,
+        "max_action_dim": 4,
+    }  # fmt: skip
+    return write_policy(directory, "wall_x", image=image, **(fields | options))
+
+
+def write_qwen3_vl(folder: Path) -> dict[str, Any]:
+    """The processor of a tiny Qwen3-VL; returns its config."""
+    vision = {"num_position_embeddings": 16, "deepstack_visual_indexes": [0]}
+    config, tokenizer = qwen_vl(folder, {"head_dim": 8}, vision)
+    images = transformers.Qwen2VLImageProcessor(min_pixels=32 * 32, max_pixels=64 * 64, patch_size=16)
+    videos = transformers.Qwen3VLVideoProcessor()
+    transformers.Qwen3VLProcessor(images, tokenizer, videos, TEMPLATE).save_pretrained(folder)
+    return config
+
+
+def write_groot(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A GR00T N1.7 on a tiny Qwen3-VL."""
+    from lerobot.policies.groot.groot_n1_7 import GR00TN17, GR00TN17Config
+
+    qwen, base = (directory.parent / f"{directory.name}-{part}" for part in ("qwen", "groot"))
+    transformers.Qwen3VLConfig(**write_qwen3_vl(qwen)).save_pretrained(qwen)
+    attention = {"num_attention_heads": 2, "attention_head_dim": 8, "dropout": 0.0, "final_dropout": False}
+    torch.manual_seed(0)
+    config = GR00TN17Config(
+        model_name=str(qwen), select_layer=1, backbone_embedding_dim=WIDTH, hidden_size=WIDTH,
+        input_embedding_dim=WIDTH, max_state_dim=8, max_action_dim=4, action_horizon=4, max_seq_len=16,
+        diffusion_model_cfg=attention | {
+            "num_layers": 2, "output_dim": WIDTH, "norm_type": "ada_norm", "interleave_self_attention": True,
+            "positional_embeddings": None,
+        },
+        vl_self_attention_cfg=attention | {"num_layers": 1, "positional_embeddings": None},
+        num_inference_timesteps=2,
+    )  # fmt: skip
+    GR00TN17(config, load_backbone_weights=False).save_pretrained(base)
+    fields = {
+        "base_model_path": str(base), "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 8,
+        "max_action_dim": 4,
+    }  # fmt: skip
+    path = write_policy(directory, "groot", image=image, **(fields | options))
+    processor = path / "policy_preprocessor.json"
+    processor.write_text(processor.read_text().replace("nvidia/Cosmos-Reason2-2B", str(qwen)))
+    return path
+
+
 def write_vla_jepa(directory: Path, *, image: int = 64, **options: Any) -> Path:
     """A VLA-JEPA on a tiny Qwen3-VL, with a tiny V-JEPA 2 for its world model."""
     qwen, jepa = (directory.parent / f"{directory.name}-{part}" for part in ("qwen", "jepa"))
-    vision = {"num_position_embeddings": 16, "deepstack_visual_indexes": [0]}
-    sizes, tokenizer = qwen_vl(qwen, {"head_dim": 8}, vision)
-    images = transformers.Qwen2VLImageProcessor(min_pixels=32 * 32, max_pixels=64 * 64, patch_size=16)
-    videos = transformers.Qwen3VLVideoProcessor()
-    transformers.Qwen3VLProcessor(images, tokenizer, videos, TEMPLATE).save_pretrained(qwen)
+    sizes = write_qwen3_vl(qwen)
     torch.manual_seed(0)
     transformers.Qwen3VLForConditionalGeneration(transformers.Qwen3VLConfig(**sizes)).save_pretrained(qwen)
     config = transformers.VJEPA2Config(
