@@ -5,7 +5,6 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,20 +18,8 @@ from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import CRASHES, POINTS, FaultError, handle, inject, proof
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
-from benchmarks.victims import CLASSES, Victim
+from benchmarks.victims import CLASSES
 from tests.replay.segments import make_segment
-
-
-def logged(folder: Path, updates: list[int], inserted: int) -> Victim:
-    """A run that ended, by its files alone."""
-    folder.mkdir()
-    books = {"replay_inserted_segments": inserted, "replay_stored_segments": 3, "replay_removed_segments": 6}
-    records: list[dict[str, Any]] = [{"kind": "train", "update": number} for number in updates]
-    lines = [json.dumps(record) for record in [*records, {"kind": "rollout", **books}]]
-    (folder / "metrics.jsonl").write_text("\n".join(lines) + '\n{"kind": "train", "up')
-    victim = object.__new__(Victim)
-    victim.folder = folder
-    return victim
 
 
 @pytest.mark.parametrize(
@@ -42,17 +29,16 @@ def logged(folder: Path, updates: list[int], inserted: int) -> Victim:
         ([1, 2, 2, 5, 5, 5], 8, {"updates": 5, "lost": 2, "doubled": 3, "books": False}),
     ],
 )
-def test_what_is_lost_or_doubled_is_found(updates: list[int], inserted: int, found: dict, tmp_path: Path):
-    assert audit_updates(logged(tmp_path / "run", updates, inserted).records()) == found
+def test_what_is_lost_or_doubled_is_found(updates: list[int], inserted: int, found: dict):
+    books = {"replay_inserted_segments": inserted, "replay_stored_segments": 3, "replay_removed_segments": 6}
+    records = [{"kind": "train", "update": number} for number in updates]
+    assert audit_updates([*records, {"kind": "rollout", **books}]) == found
 
 
 def test_segments_that_counted_are_in_the_journal_once(tmp_path: Path):
     """Four segments are in a checkpoint's replay, and one came later."""
-    run = tmp_path / "run"
-    run.mkdir()
-    journal = Journal(run / EPISODES)
     sizes = ReplayConfig(capacity=12, min_decisions=4, max_unlearned_decisions=4)
-    replay = Replay(sizes, journal)
+    replay = Replay(sizes, Journal(tmp_path / EPISODES))
     for key in "abcd":  # the first has left when the last comes
         replay.insert(make_segment(key))
 
@@ -62,22 +48,16 @@ def test_segments_that_counted_are_in_the_journal_once(tmp_path: Path):
         (folder / "pretrained_model").mkdir()
         return 3
 
-    save_checkpoint(run / CHECKPOINTS, write)
+    save_checkpoint(tmp_path / CHECKPOINTS, write)
     replay.insert(make_segment("e"))
-    found = audit_segments(run)
+    found = audit_segments(tmp_path)
     assert found == {"saved": "000003", "segments": 4, "segments_lost": 0, "segments_doubled": 0}
-    assert not list(run.glob(".*")), "nothing is left there"
 
 
 def test_every_point_is_somewhere_that_a_target_can_be_hit():
     targets = [*CLASSES, "driver", "everything"]
     found = {place for target in targets for fault in FAULTS for place in places(target, fault)}
     assert found == {ANYWHERE, *POINTS}
-    assert places("everything", "kill") == [ANYWHERE] and places("everything", "exit") == []
-    assert places("trainer rank", "hang") == ["rank.step"]
-    assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
-    assert places("inference", "nans") == [], "a decision or two that replay refuses end nobody"
-    assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
 
 
 @pytest.mark.slow
@@ -86,49 +66,33 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     root = tmp_path / "faults"
     config = BenchFaultsConfig(output_dir=str(root), targets=("rollout",), faults=("exception",), repeats=1)
     result = bench_faults(config)
-    (one,) = result["hits"]
+    (one,), (run,) = result["hits"], result["runs"]
     assert one["fired"] and one["outcome"] == "survived" and one["books"] and one["seconds"] > 0, one
-    (run,) = result["runs"]
     assert (run["exit"], run["left_behind"], run["skipped_updates"]) == (143, 0, 0)
     assert run["lost"] == run["doubled"] == run["segments_lost"] == run["segments_doubled"] == 0
     assert run["books"] and run["segments"] > 0
-    written = json.loads((root / "faults.json").read_text())
-    assert written["hits"] == result["hits"]
+    assert json.loads((root / "faults.json").read_text())["hits"] == result["hits"]
 
 
-@pytest.fixture
-def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """This process looks for orders here."""
+def test_it_happens_at_the_visit_that_was_ordered_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fault_injection, "_orders", fault_injection._Orders(tmp_path))
-    return tmp_path
-
-
-def test_it_happens_at_the_visit_that_was_ordered_and_once(orders: Path):
-    taken = inject(orders, "1", "replay.insert", "exception", at=3)
-    handle("replay.insert")
-    handle("replay.insert")
-    assert proof(taken) is None
+    taken = inject(tmp_path, "1", "replay.insert", "exception", at=3)
+    assert not handle("replay.insert") and not handle("replay.insert") and proof(taken) is None
     with pytest.raises(FaultError, match=r"replay\.insert"):
         handle("replay.insert")
     said = proof(taken)
     assert said is not None and said["pid"] == os.getpid() and said["point"] == "replay.insert"
     handle("replay.insert")
-    inject(orders, "2", "replay.insert", "exception")
+    inject(tmp_path, "2", "replay.insert", "exception")
     with pytest.raises(FaultError):  # visits are counted from the order on
         handle("replay.insert")
-
-
-def test_what_is_not_finite_may_last(orders: Path):
-    inject(orders, "1", "trainer.loss", "nan", at=2, times=3)
+    inject(tmp_path, "3", "trainer.loss", "nan", at=2, times=3)
     assert [handle("trainer.loss") for _ in range(6)] == [False, True, True, True, False, False]
 
 
 def test_every_point_is_in_the_code_once_and_no_other_is():
-    found = [
-        point
-        for path in Path(accerl_lerobot.__file__).parent.rglob("*.py")
-        for point in re.findall(r'\bfault_point\("([a-z.]+)"', path.read_text())
-    ]
+    texts = [path.read_text() for path in Path(accerl_lerobot.__file__).parent.rglob("*.py")]
+    found = [point for text in texts for point in re.findall(r'\bfault_point\("([a-z.]+)"', text)]
     # Every worker's timeline is written by the same line.
     assert sorted(found) == sorted(point for point in POINTS if not point.endswith(".timeline"))
     assert all(set(faults) <= {*CRASHES, "nan", "full", "torn"} for faults in POINTS.values())

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights that a study holds back."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -12,8 +10,6 @@ from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engines import local
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation import EvaluationConfig
-from benchmarks import study
 from benchmarks.study import BenchStudyConfig, HeldBackEngine, bench_study
 from tests.runs import drive, tiny_run, until, updates
 
@@ -32,39 +28,23 @@ def test_weights_to_hold_back_are_checked(setting: str, message: str, tmp_path: 
 
 
 def test_weights_held_back_act_so_many_updates_late_and_a_run_resumes(tiny_checkpoint: Path, tmp_path: Path):
-    fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
-    config = tiny_run(
-        tiny_checkpoint, trainer=TrainerConfig(**fields, probe_every=4), launch=LaunchConfig(engine="local")
-    )
+    trainer = TrainerConfig(updates=14, batch_decisions=16, lr=1e-3, value_warmup_updates=0, probe_every=4)
+    config = tiny_run(tiny_checkpoint, trainer=trainer, launch=LaunchConfig(engine="local"))
 
-    def begin(hold_back: int, state: Path | None = None) -> HeldBackEngine:
-        engine = HeldBackEngine(hold_back, config, ("match",), state=state)
+    def begin(state: Path | None = None) -> HeldBackEngine:
+        engine = HeldBackEngine(4, config, ("match",), state=state)
         engine.train()
         return engine
 
-    late = drive(begin(4))
+    late = drive(begin())
     lags = [update["lag_mean"] for update in updates(late)]
     assert lags[0] == 0 and all(lag >= 4 for lag in lags[5:])
     assert max(update.get("logprob/mismatch_max", 0.0) for update in updates(late)) < 1e-4
     assert late[-1].inference["version"] == late[-1].version, "the last weights act at once"
-    left = begin(4)
+    left = begin()
     before = until(left, 6)
     left.save(tmp_path)
-    after = drive(begin(4, tmp_path / TRAINING_STATE))
+    after = drive(begin(tmp_path / TRAINING_STATE))
     assert updates(before + after) == updates(late)
     with pytest.raises(InputError, match="not a state that accerl has saved"):  # it would lose its lag
         local.LocalEngine(config, ("match",), state=tmp_path / TRAINING_STATE)
-
-
-def test_a_cell_holds_weights_back(tiny_checkpoint: Path, tmp_path: Path):
-    folder = tmp_path / "cell"
-    run = tiny_run(
-        tiny_checkpoint,
-        output_dir=str(folder),
-        launch=LaunchConfig(engine="local"),
-        trainer=TrainerConfig(updates=14, batch_decisions=16),
-        evaluation=EvaluationConfig(before=False, episodes=1, videos=0),
-    )
-    study.train(folder, run, 4)
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["updates"] == 14 and summary["lag_mean"] > 9 * 4 / 14

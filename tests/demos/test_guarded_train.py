@@ -29,7 +29,6 @@ from tests.policies.tiny_pi import ACTIONS, COMMIT, PALIGEMMA, hub
 from tests.tiny_datasets import record_dataset
 
 HUB = DatasetConfig(repo_id="a/b")
-CHANGED = [(lerobot_train, "make_train_eval_datasets"), (DatasetReader, "_query_hf_dataset")]
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 
 
@@ -37,7 +36,7 @@ def run(monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], *arguments: st
     """`work` where LeRobot's trainer would be; gives what it returns."""
     got: list[Any] = []
     monkeypatch.setattr(lerobot_train, "main", lambda: got.append(work()))
-    for owner, name in CHANGED:
+    for owner, name in ((lerobot_train, "make_train_eval_datasets"), (DatasetReader, "_query_hf_dataset")):
         monkeypatch.setattr(owner, name, getattr(owner, name))  # put back after the test
     monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
     guarded_train.main()
@@ -52,28 +51,15 @@ def tokenise() -> Any:
     return type(step.action_tokenizer).__name__
 
 
-def test_pi0_fast_s_tokeniser_is_read_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_pi0_fast_s_tokeniser_is_run_at_the_commit_that_is_named(tmp_path: Path, monkeypatch: Any):
     with hub(tmp_path):
         marker = remote(tmp_path, monkeypatch)
-        assert run(monkeypatch, tokenise) == "FastTokenizer"
-    assert not marker.exists()
-
-
-def test_its_code_is_run_at_the_commit_that_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    with hub(tmp_path):
-        marker = remote(tmp_path, monkeypatch)
+        assert run(monkeypatch, tokenise) == "FastTokenizer", "it is read and not run"
         with pytest.raises(SystemExit):  # no such commit here, and the Hub is offline
-            run(monkeypatch, lambda: _refusing(tokenise), f"{TRUST}{'f' * 40}")
+            run(monkeypatch, tokenise, f"{TRUST}{'f' * 40}")
         assert not marker.exists()
         assert run(monkeypatch, tokenise, f"{TRUST}{COMMIT}") == "UniversalActionProcessor"
     assert marker.exists() and sys.argv == ["lerobot-train"], "the argument is ours and not LeRobot's"
-
-
-def _refusing(work: Callable[[], Any]) -> Any:
-    try:
-        return work()
-    except OSError as error:
-        raise InputError("sft.trust_remote_code", "", "no such commit") from error
 
 
 @pytest.mark.parametrize(
@@ -142,11 +128,10 @@ def test_trust_is_asked_for_with_a_commit(tmp_path: Path):
     for value in (True, "main", COMMIT[:39], COMMIT.upper(), f"{COMMIT}\n"):
         with pytest.raises(InputError, match="^sft.trust_remote_code=.*: use the 40 hexadecimal digits"):
             SFTConfig(trust_remote_code=value)
-    config = SFTConfig(steps=1, policy={"type": "act"}, trust_remote_code=COMMIT)
-    command = sft_command(config, HUB, tmp_path / "sft", 0, "cpu")
-    assert f"{TRUST}{COMMIT}" in command
-    plain = sft_command(SFTConfig(steps=1, policy={"type": "act"}), HUB, tmp_path / "sft", 0, "cpu")
-    assert not [a for a in plain if a.startswith(TRUST)]
+    for commit in (COMMIT, None):
+        config = SFTConfig(steps=1, policy={"type": "act"}, trust_remote_code=commit)
+        command = sft_command(config, HUB, tmp_path / "sft", 0, "cpu")
+        assert [a for a in command if a.startswith(TRUST)] == ([f"{TRUST}{COMMIT}"] if commit else [])
 
 
 def test_the_trainer_does_not_get_ray_s_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -2,6 +2,7 @@
 """Recording is deterministic, complete and readable by LeRobot; a run's episodes are replayed, exported."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,17 +12,9 @@ import yaml
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.demos.record import (
-    DemosConfig,
-    Episode,
-    check_instruction,
-    disturbed,
-    make_expert,
-    played,
-    record_demos,
-)
-from accerl_lerobot.engines.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
+from accerl_lerobot.demos import record
+from accerl_lerobot.demos.record import DemosConfig, Episode, disturbed, make_expert, played, record_demos
+from accerl_lerobot.engines.config import LaunchConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig, make_environment
 from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.errors import InputError
@@ -45,22 +38,19 @@ def rows(root: Path) -> list[dict]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("metaworld")
     root = tmp_path_factory.mktemp("demos") / "two"
-    config = DemosConfig(episodes=2)
-    assert record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(root)) == root
-    return root
+    return record_demos(MetaWorldConfig(task=TASKS, max_steps=100), DemosConfig(episodes=2), str(root))
 
 
 def test_lerobot_reads_it_and_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
     data = rows(recorded)
-    frame = data[0]
-    assert frame["observation.images.corner2"].shape == (3, 64, 64)
-    assert frame["observation.state"].shape == frame["action"].shape == (4,)
+    assert data[0]["observation.images.corner2"].shape == (3, 64, 64)
+    assert data[0]["observation.state"].shape == data[0]["action"].shape == (4,)
     texts = {row["episode_index"].item(): str(row["task"]) for row in data}
     assert texts == {0: "Press a handle down", 1: "Reach a goal position"}
     info = json.loads((recorded / "meta" / "info.json").read_text())
-    features = info["features"]
-    assert info["fps"] == 80 and features["observation.images.corner2"]["dtype"] == "image"
-    assert (features["next.success"]["dtype"], features["next.success"]["shape"]) == ("bool", [1])
+    dtypes = {name: feature["dtype"] for name, feature in info["features"].items()}
+    assert info["fps"] == 80 and dtypes["observation.images.corner2"] == "image"
+    assert dtypes["next.success"] == "bool"
     last = [i for i, row in enumerate(data) if i + 1 == len(data) or data[i + 1]["frame_index"] == 0]
     assert len(last) == 2
     for name in ("next.reward", "next.done", "next.success"):
@@ -69,9 +59,7 @@ def test_lerobot_reads_it_and_the_expert_succeeds_at_the_last_frame_of_each_epis
 
 def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: Path):
     record_dataset(tmp_path / "one", MetaWorldConfig(task=TASKS, max_steps=100), episodes=2)
-    one, two = rows(tmp_path / "one"), rows(recorded)
-    assert len(one) == len(two)
-    assert all(np.array_equal(a[key], b[key]) for a, b in zip(one, two, strict=True) for key in a)
+    np.testing.assert_equal(rows(tmp_path / "one"), rows(recorded))
 
 
 def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
@@ -84,9 +72,8 @@ def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
 
 
 def match(seed: int = 5, noise: float = 0.0, push: float = 0.0) -> Episode:
-    config = SimulatedConfig(tolerance=0.01, max_steps=20)
-    environment = make_environment(config)
-    expert = make_expert(config, environment, "match")
+    environment = make_environment(SimulatedConfig(tolerance=0.01, max_steps=20))
+    expert = make_expert(SimulatedConfig(), environment, "match")
     actions = disturbed(expert, environment.spec, seed, noise=noise, push=push, fail=False)
     return played(environment, "match", seed, actions)
 
@@ -100,13 +87,12 @@ def test_noise_is_in_the_recorded_action_and_seeded():
 
 
 def test_an_expert_that_is_pushed_misses_by_more_the_more_it_is_pushed():
-    clean, *pushed = (match(push=push) for push in (0.0, 0.1, 0.2))
-    aside = [episode.actions[0] - clean.actions[0] for episode in pushed]
-    assert all(np.ptp(episode.actions, axis=0).max() == 0 for episode in pushed), "the same all the way"
-    assert 0 < np.linalg.norm(aside[0]) <= 0.1
-    assert_close(aside[1], 2 * aside[0])
-    other = match(seed=6, push=0.2)
-    assert not np.allclose(other.actions[0] - clean.actions[0], aside[1], atol=1e-3)
+    clean, pushed, further, other = match(), match(push=0.1), match(push=0.2), match(seed=6, push=0.2)
+    assert np.ptp(pushed.actions, axis=0).max() == 0, "the same all the way"
+    aside = pushed.actions[0] - clean.actions[0]
+    assert 0 < np.linalg.norm(aside) <= 0.1
+    assert_close(further.actions[0] - clean.actions[0], 2 * aside)
+    assert not np.allclose(other.actions[0], further.actions[0], atol=1e-3)
 
 
 def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: Path):
@@ -118,21 +104,17 @@ def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: 
 
 def test_replaying_its_actions_gives_its_frames():
     pytest.importorskip("metaworld")
-    dataset = LeRobotDataset("accerl/metaworld_tiny", root=TINY, video_backend="pyav")
-    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (4, 365, 80)
     environment = make_environment(MetaWorldConfig(task="drawer-open-v3"))
-    observation, reward = environment.reset(0, "drawer-open-v3"), 0.0
-    for index in range(dataset.meta.episodes[0]["length"]):
-        row = dataset[index]
+    seen = environment.reset(0, "drawer-open-v3")
+    for row in (row for row in rows(TINY) if row["episode_index"] == 0):
         # Bit-equal on the machine that recorded it; another processor or OpenGL may round differently.
-        assert np.allclose(row["observation.state"].numpy(), observation["observation.state"], atol=1e-3)
-        if index % 10 == 0:
-            stored = (row["observation.images.corner2"] * 255).round().byte().permute(1, 2, 0).numpy()
-            assert np.abs(stored - observation["observation.images.corner2"].astype(int)).mean() < 2
-        result = environment.step_chunk(row["action"].numpy()[None])
-        observation, reward = result.observation, float(row["next.reward"])
-        assert result.rewards[0] == reward
-    assert result.terminated and reward == 1.0
+        assert np.allclose(row["observation.state"], seen["observation.state"], atol=1e-3)
+        picture = seen["observation.images.corner2"].transpose(2, 0, 1) / 255
+        assert np.abs(row["observation.images.corner2"] - picture).mean() < 2 / 255
+        result = environment.step_chunk(row["action"][None])
+        assert result.rewards[0] == row["next.reward"]
+        seen = result.observation
+    assert result.terminated and result.rewards[0] == 1.0
     environment.close()
 
 
@@ -140,7 +122,10 @@ def test_an_instruction_is_asked_for_where_the_environment_has_none():
     """`export` calls it as well, before an episode is repeated."""
     spec = replace(make_environment(SimulatedConfig()).spec, instructions=())
     with pytest.raises(InputError, match="^env.task='': each frame of a dataset has an .*--env.task="):
-        check_instruction(spec, GymConfig(id="reach/Reach-v0"))
+        record.check_instruction(spec, GymConfig(id="reach/Reach-v0"))
+
+
+WORLD = SimulatedConfig(max_steps=10, tolerance=0.45)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +133,7 @@ def run(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     folder = tmp_path_factory.mktemp("export")
     config = tiny_run(
         tiny_checkpoint,
-        env=SimulatedConfig(max_steps=10, tolerance=0.45),
+        env=WORLD,
         evaluation=EvaluationConfig(episodes=2, before=False, videos=0),
         launch=LaunchConfig(engine="local"),
     )
@@ -181,35 +166,29 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsy
         assert [int(row["policy_version"]) for row in rows] == versions
         assert [bool(row["next.done"]) for row in rows] == [False] * (len(rows) - 1) + [True]
         assert bool(rows[-1]["next.success"]) is parts[-1].success
-    settings: RunConfig = parse(RunConfig, [f"--config_path={run / 'config.yaml'}"])
-    exported_set = DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set"))
-    written = dataset_features(open_metadata(exported_set))
-    check_features(written, env_features(make_environment(settings.env).spec), {}, "dataset.repo_id", "")
+    written = dataset_features(dataset.meta)
+    check_features(written, env_features(make_environment(WORLD).spec), {}, "dataset.repo_id", "")
 
 
 def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    other = tmp_path / "run"
-    other.mkdir()
-    (other / "episodes.jsonl").write_bytes((run / "episodes.jsonl").read_bytes())
+    other = Path(shutil.copytree(run, tmp_path / "run"))
     config = yaml.safe_load((run / "config.yaml").read_text())
     config |= {"algorithm": {"type": "theirs", "discover_packages_path": "a_package"}}
     config["env"]["discover_packages_path"] = "accerl_lerobot.envs"
     config["rollout"]["reward_model"]["trust_remote_code"] = "0" * 40  # not needed to repeat episodes
     (other / "config.yaml").write_text(yaml.safe_dump(config))
-    capsys.readouterr()
+    allowed = "--env.discover_packages_path=accerl_lerobot.envs"
     assert exported(other, tmp_path / "set") == 2
-    assert "if you trust it, add --env.discover_packages_path=accerl_lerobot.envs" in capsys.readouterr().err
-    assert exported(other, tmp_path / "set", "--env.discover_packages_path=accerl_lerobot.envs") == 0
+    assert f"if you trust it, add {allowed}" in capsys.readouterr().err
+    assert exported(other, tmp_path / "set", allowed) == 0
     config["rollout"]["reward_model"]["path"] = "outputs/classifier"
     (other / "config.yaml").write_text(yaml.safe_dump(config))
-    assert exported(other, tmp_path / "judged", "--env.discover_packages_path=accerl_lerobot.envs") == 2
+    assert exported(other, tmp_path / "judged", allowed) == 2
     assert "rollout.reward_model told its successes" in capsys.readouterr().err
 
 
 def test_episodes_that_cannot_be_repeated_are_left_out(run, tmp_path, capsys):
-    other = tmp_path / "run"
-    other.mkdir()
-    (other / "config.yaml").write_bytes((run / "config.yaml").read_bytes())
+    other = Path(shutil.copytree(run, tmp_path / "run"))
     lines = (run / "episodes.jsonl").read_text().splitlines()
     changed = json.loads(lines[0])
     changed["rewards"][0] += 0.5
@@ -225,15 +204,14 @@ def test_episodes_that_cannot_be_repeated_are_left_out(run, tmp_path, capsys):
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    other = tmp_path / "world_model_run"
-    other.mkdir()
-    (other / "config.yaml").write_text("device: auto\n")
-    new = f"--root={tmp_path / 'new'}"
-    for options, message in (
-        ([f"--path={run}", f"--root={tmp_path}"], "the folder exists; choose another or remove it"),
-        ([f"--path={tmp_path}", new], "no accerl train run in it: there is no config.yaml"),
-        ([f"--path={other}", new], "no accerl train run in it: there is no episodes.jsonl"),
-        ([], "path=None: name the folder"),
+    (tmp_path / "config.yaml").write_text("device: auto\n")  # as in a run of a world model
+    (tmp_path / "empty").mkdir()
+    for path, root, message in (
+        (run, tmp_path, "the folder exists; choose another or remove it"),
+        (tmp_path / "empty", tmp_path / "new", "no accerl train run in it: there is no config.yaml"),
+        (tmp_path, tmp_path / "new", "no accerl train run in it: there is no episodes.jsonl"),
     ):
-        assert main(["export", *options]) == 2
+        assert exported(path, root) == 2
         assert message in capsys.readouterr().err
+    assert main(["export"]) == 2
+    assert "path=None: name the folder" in capsys.readouterr().err

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -26,7 +25,6 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from datasets import Image
 from tests.policies.tiny import adapter_at
-from tests.rounding import assert_close
 from tests.tiny_datasets import record_dataset
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -43,32 +41,21 @@ TINY = SFTConfig(
 )  # fmt: skip
 
 
-def stock_dataset(episodes: list[int] | None = None) -> LeRobotDataset:
-    chunk = {"action": [i / 80 for i in range(4)]}
-    return LeRobotDataset(
-        "a/b", ROOT, episodes, delta_timestamps=chunk, video_backend="pyav", return_uint8=True
-    )
-
-
-def equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return one.keys() == other.keys() and all(
-        torch.equal(one[k], other[k]) if isinstance(one[k], torch.Tensor) else one[k] == other[k] for k in one
-    )
-
-
 @pytest.mark.parametrize("episodes", [None, [1, 2]])
 def test_items_are_the_stock_ones_from_memory_and_decode_no_image_twice(episodes: Any, monkeypatch: Any):
-    dataset = stock_dataset(episodes)
+    options = {"delta_timestamps": {"action": [0, 1 / 80, 2 / 80]}, "video_backend": "pyav"}
+    dataset = LeRobotDataset("a/b", ROOT, episodes, return_uint8=True, **options)
     indices = (0, 7, 88, len(dataset) - 1)
     stock = [dataset[index] for index in indices]
-    assert stock[-1]["action_is_pad"].tolist() == [False, True, True, True]  # reaches beyond its episode
+    assert stock[-1]["action_is_pad"].tolist() == [False, True, True]  # reaches beyond its episode
     decode, decoded = Image.decode_example, []
     monkeypatch.setattr(Image, "decode_example", lambda *args, **kw: decoded.append(1) or decode(*args, **kw))
     monkeypatch.setattr(DatasetReader, "_query_hf_dataset", guarded_train.query_rows)
     cached = guarded_train.CachedDataset(dataset)
     assert cached.meta is dataset.meta and len(cached) == cached.num_frames == len(dataset)
-    for _ in range(2):
-        assert all(equal(cached[index], item) for index, item in zip(indices, stock, strict=True))
+    for index, item in [*zip(indices, stock, strict=True)] * 2:
+        assert cached[index].keys() == item.keys()
+        assert all(np.array_equal(cached[index][key], item[key]) for key in item)
     assert len(decoded) == len(indices)
 
 
@@ -89,20 +76,10 @@ def test_episodes_are_picked_by_their_label(tmp_path: Path):
 def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     path = run_sft(TINY, LOCAL, tmp_path / "sft", seed=0, texts=["Open a drawer"])
     assert path == tmp_path / "sft" / "checkpoints" / "last" / "pretrained_model"
-    assert "End of training" in (tmp_path / "sft.log").read_text()
     adapter = adapter_at(path)
     shape = adapter.family.shape
     assert (shape.executed, shape.action_dim, shape.padded_dim) == (4, 4, 4)
     assert list(adapter.policy.config.image_features) == [CAMERA]
-    item = stock_dataset()[100]
-    observation = {
-        "observation.state": item["observation.state"].numpy()[None],
-        CAMERA: item[CAMERA].permute(1, 2, 0).numpy()[None],
-    }
-    batch = adapter.processing.prepare(observation, [item["task"]])
-    stats = stock_dataset().meta.stats["observation.state"]
-    expected = (observation["observation.state"] - stats["mean"]) / (stats["std"] + 1e-8)
-    assert_close(batch["observation.state"], expected)  # the dataset's normalisation
 
 
 def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
@@ -133,7 +110,6 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     lines = [
         "INFO 2026-01-01 12:00:00 train.py:1 step:25 smpl:2K ep:4 epch:0.41 loss:1.250 grdn:2.0 lr:1.0e-03",
         "a line: with colons",
-        "Training:   1%|  | 48/9000 [00:01<3:52:57,  1.22step/s]INFO step:50 smpl:3K loss:1.0",
         "step:2K loss:0.5",
         "Training:  15%|█▍ | 2975/20000 [18:59<3:52:57,  1.22step/s]INFO step:3K smpl:190K loss:0.259",
         "step:1M loss:nan",
@@ -142,12 +118,11 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command_that(monkeypatch, f"print({chr(10).join(lines)!r})")
     seen: list[tuple[int, float]] = []
     run_sft(TINY, HUB, tmp_path / "sft", seed=0, on_step=lambda step, loss: seen.append((step, loss)))
-    assert seen[:4] == [(25, 1.25), (50, 1.0), (2000, 0.5), (2975, 0.259)]
-    assert seen[4][0] == 1_000_000 and np.isnan(seen[4][1]) and len(seen) == 5
+    np.testing.assert_array_equal(seen, [(25, 1.25), (2000, 0.5), (2975, 0.259), (1_000_000, np.nan)])
 
 
 def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    program = "import os, time\nprint(f'step:{os.getpid()} loss:1', flush=True)\ntime.sleep(600)"
+    program = "import os, time; print(f'step:{os.getpid()} loss:1', flush=True); time.sleep(600)"
     command_that(monkeypatch, program)
     seen: list[int] = []
 
@@ -174,24 +149,19 @@ def test_the_command_line(tmp_path: Path):
         "--dataset.repo_id=a/b", "--dataset.root=/data", "--dataset.revision=v1",
         "--dataset.episodes=[0, 2]", "--steps=2", "--seed=3",
     } <= set(command)  # fmt: skip
-    (tmp_path / "config.json").write_text('{"type": "smolvla"}')
-    config = SFTConfig(steps=2, init_path=str(tmp_path), extra_args=["--log_freq=1"])
-    command = sft_command(config, HUB, tmp_path / "sft", 0, "cuda")
-    assert f"--policy.path={tmp_path}" in command and command[-1] == "--log_freq=1"
-    assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
 
 
 @pytest.mark.parametrize(
     ("kind", "schedule"), [("act", set()), ("diffusion", {"--policy.scheduler_warmup_steps=20"})]
 )
 def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set[str]):
-    start = SFTConfig(steps=9, policy={"type": kind})
-    command = sft_command(start, HUB, tmp_path / "sft", 0, "cpu")
-    assert "--policy.optimizer_lr=0.001" in command
+    command = sft_command(SFTConfig(steps=9, policy={"type": kind}), HUB, tmp_path / "sft", 0, "cpu")
     assert {a for a in command if "scheduler" in a} == schedule
     assert not [a for a in command if "pretrained_backbone_weights" in a], "a new policy's own choice"
     (tmp_path / "config.json").write_text(json.dumps({"type": kind}))
-    command = sft_command(SFTConfig(steps=9, init_path=str(tmp_path)), HUB, tmp_path / "sft", 0, "cpu")
+    start = SFTConfig(steps=9, init_path=str(tmp_path), extra_args=["--log_freq=1"])
+    command = sft_command(start, HUB, tmp_path / "sft", 0, "cpu")
+    assert f"--policy.path={tmp_path}" in command and command[-1] == "--log_freq=1"
     assert "--policy.pretrained_backbone_weights=null" in command, "the checkpoint replaces them"
 
 
@@ -199,12 +169,8 @@ def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, mo
     start, moved = tmp_path / "start", tmp_path / "moved"
     adapter_at(tiny_checkpoint).save(start)
     seen: list[str | None] = []
-
-    def command(config: SFTConfig, *rest: object) -> list[str]:
-        seen.append(config.init_path)
-        return [sys.executable, "-c", ""]
-
-    monkeypatch.setattr(sft, "sft_command", command)
+    nothing = [sys.executable, "-c", ""]
+    monkeypatch.setattr(sft, "sft_command", lambda config, *_: seen.append(config.init_path) or nothing)
     run_sft(SFTConfig(steps=1, init_path=str(start)), HUB, tmp_path / "one" / "sft", seed=0)
     shutil.move(start, moved)
     before = (moved / "config.json").read_text()

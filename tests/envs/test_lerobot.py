@@ -4,37 +4,18 @@
 import importlib
 import json
 import shlex
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from huggingface_hub import constants
 
 from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.envs.gym_env import LeRobotEnvironment
 from accerl_lerobot.errors import InputError
 from tests.hub_cache import cached_repo
-
-pytest.importorskip("lerobot")
-
-
-@pytest.fixture
-def pusht():
-    pytest.importorskip("gym_pusht")
-    environment = LeRobotEnvironment(LeRobotEnvConfig(name="pusht", camera="top"))
-    yield environment
-    environment.close()
-
-
-def test_lerobots_limit_is_the_default(pusht: LeRobotEnvironment):
-    assert pusht.spec.max_steps == 300
-    shorter = LeRobotEnvironment(LeRobotEnvConfig(name="pusht", max_steps=9, success="succeed"))
-    shorter.reset(0, "pusht")
-    result = shorter.step_chunk(np.full((20, 2), 256, np.float32))
-    shorter.close()
-    assert result.truncated and result.steps == 9
-    assert "env.success='succeed': the environment's info has no such key" in result.note
-    assert "is_success" in result.note
 
 
 def test_the_command_for_stock_lerobot():
@@ -43,20 +24,22 @@ def test_the_command_for_stock_lerobot():
     flags = {"type=pusht", "obs_type=pixels", "episode_length=9", "discover_packages_path=my_envs"}
     assert {f"--env.{flag}" for flag in flags} < set(command) and "rename_map" not in str(command)
     assert lerobot_eval_arguments(env | {"success": "succeed"}, {}) == [], "LeRobot reads its own key only"
-    env["camera"] = "top"  # LeRobot is told the name of its lone camera
     renames = {"observation.images.top": "observation.images.camera1"}
-    for given, expected in ((renames, "observation.images.camera1"), ({}, "observation.images.top")):
-        [text] = [text for text in lerobot_eval_arguments(env, given) if text.startswith("--rename_map=")]
-        [argument] = shlex.split(text)
-        named = json.loads(argument.removeprefix("--rename_map="))
-        assert named == given | {"observation.image": expected}
+    text = lerobot_eval_arguments(env | {"camera": "top"}, renames)[-2]
+    named = {"observation.image": "observation.images.camera1"}  # LeRobot's name of its lone camera
+    [argument] = shlex.split(text)
+    assert json.loads(argument.removeprefix("--rename_map=")) == renames | named
 
 
-def test_images_are_what_the_environment_drew(pusht: LeRobotEnvironment):
+def test_images_and_states_are_lerobot_s():
+    pytest.importorskip("gym_pusht")
+    pusht = LeRobotEnvironment(LeRobotEnvConfig(name="pusht", camera="top"))
+    assert pusht.spec.max_steps == 300, "LeRobot's limit"
     ours = pusht.reset(7, "pusht")
     raw, _ = pusht.environments["pusht"].reset(seed=7)
     assert np.array_equal(ours["observation.images.top"], raw["pixels"])
     assert np.array_equal(ours["observation.state"], raw["agent_pos"].astype(np.float32))
+    pusht.close()
 
 
 @pytest.mark.parametrize(
@@ -92,25 +75,20 @@ def test_stock_lerobot_sees_our_world(plugin):
         plugin(image_size=10)
     config = plugin(task="handle-press-v3", max_steps=6)
     shapes = {key: tuple(feature.shape) for key, feature in env_to_policy_features(config).items()}
-    image_shape = {"observation.images.corner2": (3, 64, 64)}
-    assert shapes == {"action": (4,), "observation.state": (4,), **image_shape}
-    vectors = make_env(config, n_envs=2)
-    vector = vectors["handle-press-v3"][0]
+    camera = "observation.images.corner2"
+    assert shapes == {"action": (4,), "observation.state": (4,), camera: (3, 64, 64)}
+    vector = make_env(config, n_envs=2)["handle-press-v3"][0]
     seen = preprocess_observation(vector.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})[0])
     environment = make_environment(MetaWorldConfig(task="handle-press-v3", max_steps=6))
     ours = environment.reset(3, "handle-press-v3")
-    image = (seen["observation.images.corner2"][0] * 255).round().byte().permute(1, 2, 0).numpy()
-    assert np.array_equal(image, ours["observation.images.corner2"])
+    image = (seen[camera][0] * 255).round().byte().permute(1, 2, 0).numpy()
+    assert np.array_equal(image, ours[camera])
     assert np.array_equal(seen["observation.state"][0].numpy(), ours["observation.state"])
     assert vector.call("task_description") == (ours["task"],) * 2
     assert vector.call("_max_episode_steps") == (6, 6)
-    idle = np.zeros((2, 4), np.float32)
-    for step in range(6):
-        _, _, terminated, truncated, info = vector.step(idle)
+    for _ in range(9):
+        _, _, terminated, _, info = vector.step(np.zeros((2, 4), np.float32))
         assert not terminated.any() and not info["is_success"].any()
-        assert truncated.all() == (step == 5)
-    for _ in range(3):
-        vector.step(idle)
     assert all(env.is_frozen for env in vector.envs), "an episode that is over is not played again"
     assert vector.envs[0].render().shape == (256, 256, 3)
     vector.close()
@@ -126,38 +104,22 @@ def test_stock_lerobot_runs_a_gymnasium_environment(monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "packages" / "lerobot_env_reach"))
     environment = {"type": "gym", "id": "reach/Reach-v0", "discover_packages_path": "lerobot_env_reach"}
     environment |= {"images": {"front": "pixels"}, "state": ["agent_pos", "goal"], "max_steps": 5, "fps": 10}
-    with pytest.raises(
-        InputError, match="only the command line .* add --env.environment.discover_packages_path="
-    ):
+    said = "only the command line .* add --env.environment.discover_packages_path="
+    with pytest.raises(InputError, match=said):
         make_env_config("accerl", environment=environment | {"discover_packages_path": "somebodys"})
     importlib.import_module("lerobot_env_reach")
     settings = make_env_config("accerl", environment=environment)
     assert settings.fps == 10 and settings.features["agent_pos"].shape == (4,)
-    vector = make_env(settings, n_envs=2, use_async_envs=asynchronous)["reach/Reach-v0"][0]
-    try:
+    made = make_env(settings, n_envs=2, use_async_envs=asynchronous)
+    with closing(made["reach/Reach-v0"][0]) as vector:
         seen, _ = vector.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})
         ours = make_environment(GymConfig(**{k: v for k, v in environment.items() if k != "type"}))
         assert np.array_equal(seen["agent_pos"][1], ours.reset(4, "reach/Reach-v0")["observation.state"])
         ends = [vector.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(5)]
         assert ends == [False] * 4 + [True]
-    finally:
-        vector.close()
 
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
-
-
-@pytest.fixture
-def arena(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    """An environment in the Hub's cache whose code leaves a mark when it is run."""
-    from huggingface_hub import constants
-
-    marker = tmp_path / "was-run"
-    code = f"from pathlib import Path\nPath({str(marker)!r}).touch()\n"
-    env = cached_repo(tmp_path, "them/arena", COMMIT) / "env.py"
-    env.write_text(f"{code}def make_env(**options): raise OSError('ran')\n")
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    return marker
 
 
 @pytest.mark.parametrize(
@@ -166,19 +128,15 @@ def arena(tmp_path, monkeypatch: pytest.MonkeyPatch):
         (f"them/arena@{COMMIT}", False, "env.trust_remote_code=False: isaaclab_arena is code of them/arena"),
         ("them/arena@main", True, "env.kwargs.hub_path='them/arena@main': name a commit"),
         (f"them/arena@{COMMIT}:../../env.py", True, "env.kwargs.hub_path="),
+        (f"them/arena@{COMMIT}:env.py", True, r"env\.name='isaaclab_arena': .*\(OSError: ran\)"),
     ],
 )
-def test_environments_on_the_hub_are_not_run_unasked(arena, hub_path: str, trust: bool, said: str):
-    config = LeRobotEnvConfig(
-        name="isaaclab_arena", kwargs={"hub_path": hub_path}, trust_remote_code=trust, max_steps=5
-    )
+def test_environments_on_the_hub_are_not_run_unasked(hub_path, trust, said, tmp_path, monkeypatch):
+    marker = tmp_path / "was-run"
+    code = f"open({str(marker)!r}, 'w')\ndef make_env(**options): raise OSError('ran')\n"
+    (cached_repo(tmp_path, "them/arena", COMMIT) / "env.py").write_text(code)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    kwargs = {"hub_path": hub_path}
     with pytest.raises(InputError, match=f"^{said}"):
-        make_environment(config)
-    assert not arena.exists()
-
-
-def test_an_environment_is_run_at_its_commit(arena):
-    kwargs = {"hub_path": f"them/arena@{COMMIT}:env.py"}
-    with pytest.raises(InputError, match=r"^env\.name='isaaclab_arena': .*\(OSError: ran\)"):
-        make_environment(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
-    assert arena.exists()
+        make_environment(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=trust))
+    assert marker.exists() == said.endswith(r"ran\)")

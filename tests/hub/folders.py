@@ -13,9 +13,7 @@ import pytest
 import yaml
 
 from accerl_lerobot import cli
-from tests.hub_server import NOBODY, READER, STRANGER, WRITER
 
-TOKENS = (WRITER, READER, STRANGER, NOBODY)
 SUMMARY = {
     "success_before": 0.25, "success_after": 0.75, "n_before": 40, "n_after": 40,
     "ci95_before": [0.1419, 0.4019], "ci95_after": [0.5981, 0.8581],
@@ -26,14 +24,22 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[str, str]:
-    """The one line of a command that is refused, and all that it has said."""
+def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    """What a command that succeeds has said."""
+    capsys.readouterr()
+    assert cli.main(list(arguments)) == 0, capsys.readouterr().err
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line of a command that is refused."""
     capsys.readouterr()
     assert cli.main(list(arguments)) == 2
     out, err = capsys.readouterr()
     (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
-    assert out == "" and "Traceback" not in err and not any(token in err for token in TOKENS)
-    return line, err
+    assert out == "" and "Traceback" not in err and "hf_" not in err, "no token is told"
+    return line
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -17,64 +17,56 @@ from accerl_lerobot.hub.transfer import stage
 from accerl_lerobot.policies.config import PLUGINS
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
-TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+LAST = "checkpoints/last/pretrained_model"
 
 
-def card_of(folder: Path, kind: str, **fields: str) -> str:
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_run_folder(tmp_path / "run")
+
+
+def card_of(folder: Path, kind: str = "policy", **fields: str) -> str:
     files = stage(PushConfig(path=str(folder), repo_id="alice/door", **fields), folder, kind)
     return bytes(files["README.md"]).decode()
 
 
-def test_a_folder_is_no_base_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run = write_run_folder(tmp_path / "run")
-    monkeypatch.chdir(tmp_path)
-    Path("lerobot/smolvla_base").mkdir(parents=True)
-    assert ModelCard(card_of(run / "checkpoints/last/pretrained_model", "policy")).data.base_model is None
-
-
-def test_metadata(tmp_path: Path):
-    run = write_run_folder(tmp_path / "run")
-    data = ModelCard(card_of(run / "checkpoints/last/pretrained_model", "policy")).data
+def test_metadata(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    data = ModelCard(card_of(run / LAST)).data
     assert data.library_name == "lerobot" and data.pipeline_tag == "robotics"
     assert data.tags == ["accerl-lerobot", "policy", "act", "metaworld", "reinforcement-learning", "gipo"]
     assert data.base_model == "lerobot/smolvla_base"
     assert data.datasets is None, "the dataset was a folder, its name a label"
-    earlier = ModelCard(card_of(run / "checkpoints/000006/pretrained_model", "policy"))
-    assert "## Measured" not in earlier.text
+    monkeypatch.chdir(tmp_path)
+    Path("lerobot/smolvla_base").mkdir(parents=True)
+    assert ModelCard(card_of(run / LAST)).data.base_model is None, "a folder is no base model"
 
 
-def test_numbers_films_and_recipe_for_people(tmp_path: Path):
-    run = write_run_folder(tmp_path / "run")
-    text = card_of(run / "checkpoints/last/pretrained_model", "policy")
+def test_numbers_films_and_recipe_for_people(run: Path, tmp_path: Path):
+    text = card_of(run / LAST)
     assert "\n# door\n" in text
     assert "| before RL | match | 25.0% | 40 | 14.2% to 40.2% |" in text
     assert "| after RL | match | 75.0% | 40 | 59.8% to 85.8% |" in text
     assert "| env steps | 12,345 |" in text and "| updates | 12 |" in text and "| seed | 3 |" in text
     assert 'src="accerl_run/before_after.mp4"' in text and "](accerl_run/success_curve.png)" in text
     assert "task: door-open-v3" in text and str(tmp_path) not in text
+    assert "## Measured" not in card_of(run / "checkpoints/000006/pretrained_model")
 
 
-def test_an_evaluation_is_what_counts_last(tmp_path: Path):
-    policy = write_run_folder(tmp_path / "run") / "checkpoints/last/pretrained_model"
+def test_an_evaluation_is_what_counts_last(run: Path, tmp_path: Path):
+    policy = run / LAST
     tasks = {t: {"success": s, "n": 50, "ci95": [0.1, 0.9]} for t, s in (("a", 0.4), ("b", 0.6))}
     found = {"success": 0.5, "n": 100, "ci95": [0.4038, 0.5962], "tasks": tasks, "policy": str(policy)}
     write_json(tmp_path / "eval" / "evaluation.json", found)
-    text = card_of(policy, "policy", evaluation=str(tmp_path / "eval"))
+    text = card_of(policy, evaluation=str(tmp_path / "eval"))
     assert "| accerl eval | all tasks | 50.0% | 100 | 40.4% to 59.6% |" in text
     assert "| accerl eval | b | 60.0% | 50 |" in text
 
 
-@pytest.mark.parametrize("kind", ["policy", "world model"])
-def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
-    folder = write_run_folder(tmp_path / "run")
-    if kind == "policy":
-        folder = folder / "checkpoints" / "last" / "pretrained_model"
-    else:
-        write_json(folder / "config.json", {"spec": {}, "model": {}})
-    text = card_of(folder, kind).split("```bash\n")
-    commands = [
-        line for block in text[1:] for line in block.split("```")[0].splitlines() if line[:7] == "accerl "
-    ]
+@pytest.mark.parametrize(("kind", "place"), [("policy", LAST), ("world model", "")])
+def test_commands_in_the_card_are_commands(run: Path, kind: str, place: str):
+    write_json(run / "config.json", {"spec": {}, "model": {}})
+    blocks = [part.split("```")[0] for part in card_of(run / place, kind).split("```bash\n")[1:]]
+    commands = [line for block in blocks for line in block.splitlines() if line.startswith("accerl ")]
     assert any(line.startswith("accerl pull --repo_id=alice/door") for line in commands)
     for line in commands:
         _, verb, *arguments = shlex.split(line)
@@ -84,24 +76,15 @@ def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
 def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(PLUGINS, "smolvla_bins", "lerobot_policy_smolvla_bins")
     run = write_run_folder(tmp_path / "run", type="smolvla_bins", vlm_model_name="org/vlm")
-    text = card_of(run / "checkpoints/last/pretrained_model", "policy")
-    assert "lerobot-eval --policy.path=door" in text and '"task": "door-open-v3"' in text
-    assert "--policy.discover_packages_path=lerobot_policy_smolvla_bins" in text
-    assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
-    assert "--rename_map" not in text
-
-
-def test_stock_lerobot_is_told_the_names_that_the_run_gave(tmp_path: Path):
-    run = write_run_folder(tmp_path / "run")
     recipe = yaml.safe_load((run / "config.yaml").read_text())
     recipe["policy"]["rename_map"] = {"observation.images.corner2": "observation.images.camera1"}
     (run / "config.yaml").write_text(yaml.safe_dump(recipe))
-    [line] = [
-        line for line in card_of(run / "checkpoints/last/pretrained_model", "policy").splitlines()
-        if line.startswith("lerobot-eval")
-    ]  # fmt: skip
-    renames = '{"observation.images.corner2": "observation.images.camera1"}'
-    assert f"--rename_map={renames}" in shlex.split(line)
+    text = card_of(run / LAST)
+    [line] = [line for line in text.splitlines() if line.startswith("lerobot-eval --policy.path=door")]
+    assert "--policy.discover_packages_path=lerobot_policy_smolvla_bins" in line
+    assert '"task": "door-open-v3"' in line
+    assert '--rename_map={"observation.images.corner2": "observation.images.camera1"}' in shlex.split(line)
+    assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
 
 
 def test_a_validation_is_reported(tmp_path: Path):
@@ -119,4 +102,4 @@ def test_the_users_own_card_is_left_alone(tmp_path: Path):
     files = stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
     assert files["README.md"] == folder / "README.md"
     (folder / "README.md").write_text(f"{MARK}\nold\n")  # ours, of an earlier push
-    assert "old" not in card_of(folder, "policy")
+    assert "old" not in card_of(folder)

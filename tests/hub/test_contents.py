@@ -16,15 +16,6 @@ from accerl_lerobot.hub.transfer import stage, without_paths
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
-TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "x"}}
-
-
-def test_kinds(tmp_path: Path):
-    assert recognise(write_policy_folder(tmp_path / "policy")) == "policy"
-    assert recognise(TINY) == "dataset"
-    write_json(tmp_path / "environment" / "config.json", {"spec": {}, "model": {}})
-    (tmp_path / "environment" / "model.safetensors").write_bytes(b"x")
-    assert recognise(tmp_path / "environment") == "world model"
 
 
 @pytest.mark.parametrize(
@@ -36,28 +27,20 @@ def test_kinds(tmp_path: Path):
     ],
 )
 def test_an_incomplete_folder_says_what_it_lacks(tmp_path: Path, artifact: str, missing: str):
-    write = {"policy": write_policy_folder, "dataset": copy_dataset}[artifact]
-    (write(tmp_path / "folder") / missing).unlink()
+    folder = tmp_path / "folder"
+    write_policy_folder(folder) if artifact == "policy" else shutil.copytree(TINY, folder)
+    (folder / missing).unlink()
     with pytest.raises(InputError, match=f"looks like a {artifact} but lacks {missing}"):
-        recognise(tmp_path / "folder")
-
-
-def copy_dataset(folder: Path) -> Path:
-    return Path(shutil.copytree(TINY, folder))
+        recognise(folder)
 
 
 def test_folders_one_above_say_which_below(tmp_path: Path):
-    run = write_run_folder(tmp_path / "run")
-    with pytest.raises(InputError, match="name the folder checkpoints/last/pretrained_model in it"):
-        recognise(run)
-    with pytest.raises(InputError, match="name the folder pretrained_model in it"):
-        recognise(run / "checkpoints" / "000012")
-    (tmp_path / "tuned" / "sft" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
-    with pytest.raises(InputError, match="name the folder sft/checkpoints/last/pretrained_model in it"):
-        recognise(tmp_path / "tuned")
-    (tmp_path / "learnt" / "world_model").mkdir(parents=True)
-    with pytest.raises(InputError, match="name the folder world_model in it"):
-        recognise(tmp_path / "learnt")
+    last = "checkpoints/last/pretrained_model"
+    for below in (last, f"sft/{last}", "pretrained_model", "world_model"):
+        above = tmp_path / f"above {below.replace('/', ' ')}"
+        (above / below).mkdir(parents=True)
+        with pytest.raises(InputError, match=f"name the folder {below} in it"):
+            recognise(above)
     write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
     for folder in (tmp_path / "success_model", tmp_path):
         with pytest.raises(InputError, match="neither a policy, a world model nor a LeRobotDataset"):
@@ -68,12 +51,10 @@ def test_folders_one_above_say_which_below(tmp_path: Path):
 
 @pytest.mark.parametrize("name", [None, "", "door", "a/b/c", "../x/y", "a/b c", "https://x/y"])
 def test_what_is_no_name_of_a_repository(name: str | None):
-    for make in (
-        lambda: PushConfig(path="x", repo_id=name),
-        lambda: PullConfig(repo_id=name, output_dir="x"),
-    ):
-        with pytest.raises(InputError, match="user/name"):
-            make()
+    with pytest.raises(InputError, match="user/name"):
+        PushConfig(path="x", repo_id=name)
+    with pytest.raises(InputError, match="user/name"):
+        PullConfig(repo_id=name, output_dir="x")
 
 
 def staged(folder: Path) -> Files:
@@ -119,7 +100,7 @@ def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
 
 def test_a_backbone_is_named_by_its_place_beside_the_weights(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy", type="smolvla", vlm_model_name=str(tmp_path / "gone"))
-    step = TOKENIZER | {"config": {"tokenizer_name": str(tmp_path / "gone")}}
+    step = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": str(tmp_path / "gone")}}
     write_json(folder / "policy_preprocessor.json", {"steps": [step]})
     with pytest.raises(InputError, match="put a copy into backbone/"):
         staged(folder)
@@ -131,22 +112,10 @@ def test_a_backbone_is_named_by_its_place_beside_the_weights(tmp_path: Path):
     assert str(tmp_path / "gone") in (folder / "config.json").read_text(), "the folder itself is as it was"
 
 
-def test_numbers_go_only_with_the_policy_they_are_of(tmp_path: Path):
-    run = write_run_folder(tmp_path / "run")
-    last = run_files(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
-    names = ("config.yaml", "summary.json", "success_curve.png", "before_after.mp4")
-    assert last == {f"accerl_run/{name}": run / name for name in names}
-    earlier = run_files(run / "checkpoints" / "000006" / "pretrained_model", "policy", None)
-    assert set(earlier) == {"accerl_run/config.yaml"}
-    assert run_files(write_policy_folder(tmp_path / "alone"), "policy", None) == {}
-
-
 def test_an_evaluation_is_of_this_policy_or_refused(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
     policy = run / "checkpoints" / "000006" / "pretrained_model"
-    found = {"success": 0.5, "n": 10, "ci95": [0.2366, 0.7634], "tasks": {}, "policy": str(policy)}
-    write_json(tmp_path / "eval" / "evaluation.json", found)
-    assert "accerl_run/evaluation.json" in run_files(policy, "policy", str(tmp_path / "eval"))
+    write_json(tmp_path / "eval" / "evaluation.json", {"success": 0.5, "policy": str(policy)})
     other = run / "checkpoints" / "000012" / "pretrained_model"
     for folder, evaluation in ((other, tmp_path / "eval"), (policy, tmp_path)):
         with pytest.raises(InputError, match="not an evaluation of "):
@@ -155,30 +124,20 @@ def test_an_evaluation_is_of_this_policy_or_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", ["json", "yaml"])
 def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
-    tree = {
-        "other": str(tmp_path.parent / "with blanks" / "demos"),
-        "output_dir": str(tmp_path),
-        "nested": [{"argument": f"--root={tmp_path.parent}/data/x.json,y"}],
-        "home": "~/runs/one",
-        "mac": "/Users/somebody/model",
-        "beside": "../runs/two",
-        "container": "/data",
-        "above": "..",
-        "kept": ["lerobot/smolvla_base", "observation.front", 0.5, None, True, "m/s", "1/2/3", "/"],
-        "targets": r"layers\..\.q_proj",
-        "url": "https://example.org/tmp/a/b",
-        "pattern": "data/*/*.parquet",
+    changes = {
+        str(tmp_path.parent / "with blanks" / "demos"): "LOCAL/demos",
+        f"--root={tmp_path.parent}/data/x.json,y": "--root=LOCAL/x.json,y",
+        "~/runs/one": "LOCAL/one",
+        "/Users/somebody/model": "LOCAL/model",
+        "../runs/two": "LOCAL/two",
+        "/data": "LOCAL/data",
+        "..": "LOCAL/",
     }
-    wanted = tree | {
-        "other": "LOCAL/demos",
-        "output_dir": None,
-        "nested": [{"argument": "--root=LOCAL/x.json,y"}],
-        "home": "LOCAL/one",
-        "mac": "LOCAL/model",
-        "beside": "LOCAL/two",
-        "container": "LOCAL/data",
-        "above": "LOCAL/",
-    }
+    kept = ["lerobot/smolvla_base", "observation.front", 0.5, None, True, "m/s", "1/2/3", "/"]
+    kept += ["https://example.org/tmp/a/b", "data/*/*.parquet"]
+    same = {"kept": kept, "targets": r"layers\..\.q_proj"}
+    tree = same | {"output_dir": str(tmp_path), "nested": [{"paths": list(changes)}]}
+    wanted = same | {"output_dir": None, "nested": [{"paths": list(changes.values())}]}
     dump = json.dumps if suffix == "json" else yaml.safe_dump
     data = without_paths(f"a.{suffix}", dump(tree).encode())
     assert yaml.safe_load(bytes(data)) == wanted

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timelines that tests choose, a clock that they turn, and what is so of every timeline."""
+"""Timelines that tests choose, and what is so of every timeline."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,34 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.timeline import TIMELINE, Clock, Row, Timeline
+from accerl_lerobot.timeline import STATES, TIMELINE, Clock, Row, Timeline
 
 SECOND = 10**9
-BEGIN = 10**18  # time of the calendar when a test begins
 
 
-class Hands:
-    """Hands of a clock, which stand still unless a test turns them."""
-
-    def __init__(self, at_s: float) -> None:
-        self.now = BEGIN + round(at_s * SECOND)
-
-    def __call__(self) -> int:
-        return self.now
-
-
-def a_clock(run: Path, worker: str = "trainer", *, at_s: float = 0.0) -> tuple[Clock, Hands]:
-    """A worker's clock, whose process begins at a second of the calendar, and its hands."""
-    hands = Hands(at_s)
-    return Clock(run / TIMELINE, worker, hands), hands
-
-
-def write_worker(run: Path, worker: str, spans: Iterable[tuple[int, float]], *, at_s: float = 0.0) -> None:
+def write_worker(run: Path, worker: str, spans: Iterable[tuple[str, float]], *, at_s: float = 0.0) -> None:
     """One process of a worker, to its end; `spans`: states, and how many seconds it was in each."""
-    clock, hands = a_clock(run, worker, at_s=at_s)
+    now = 10**18 + round(at_s * SECOND)
+    clock = Clock(run / TIMELINE, worker, lambda: now)
     for state, length in spans:
-        clock.enter(state)
-        hands.now += round(length * SECOND)
+        clock.enter(STATES.index(state))
+        now += round(length * SECOND)
     clock.close()
 
 
