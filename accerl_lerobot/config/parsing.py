@@ -126,7 +126,7 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     """
     path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
     register_types(config_class, given)
-    tree = {} if path is None else _on_its_base(read_recipe(path), recipe_class or config_class)
+    tree = {} if path is None else _recipe_on_base(path, recipe_class or config_class)
     if recipe_class is not None:
         tree = _for_verb(tree, config_class, recipe_class)
     merged = _overridden(config_class, tree, given)
@@ -137,24 +137,27 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     return decode(config_class, merged)
 
 
-def _on_its_base(
-    tree: dict[str, Any], config_class: type[Any], above: tuple[str, ...] = ()
-) -> dict[str, Any]:
+def _recipe_on_base(path: Path, config_class: type[Any], above: tuple[Path, ...] = ()) -> dict[str, Any]:
     """A recipe with what it does not say taken from the recipe that its key `BASE` names, if it has one.
 
-    `above` are the recipes that are laid on this one.
+    A base is looked for beside the recipe first. `above` are the recipes that are laid on this one.
     """
-    if BASE not in tree:
-        return tree
-    over = dict(tree)
+    over = read_recipe(path)
+    if BASE not in over:
+        return over
     base = str(over.pop(BASE))
-    if base in above:
+    below = path.parent / base
+    if not below.is_file():
+        below = expanded(base, BASE)
+    if below in (path, *above):
         raise InputError(BASE, base, "this recipe is laid on itself; leave the line out")
     try:
-        below = read_recipe(expanded(base, BASE))
+        tree = _recipe_on_base(below, config_class, (*above, path))
     except InputError as error:
+        if error.field != "config_path":
+            raise
         raise InputError(BASE, base, error.hint) from error
-    return _overridden(config_class, _on_its_base(below, config_class, (*above, base)), over)
+    return _overridden(config_class, tree, over)
 
 
 def _for_verb(tree: dict[str, Any], config_class: type[Any], recipe_class: type[Any]) -> dict[str, Any]:

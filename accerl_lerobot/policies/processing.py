@@ -202,7 +202,8 @@ def check_statistics(
             continue
         chosen = {ACTION}
         if isinstance(step, NormalizerProcessorStep):
-            chosen = set(step.normalize_observation_keys or step.features) - chosen
+            keys = step.normalize_observation_keys  # None: all
+            chosen = set(step.features if keys is None else keys) - chosen
         for name in sorted(chosen & features.keys()):
             mode = step.norm_map.get(features[name].type)
             needed = STATISTICS.get(mode, ())
