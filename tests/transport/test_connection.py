@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages over sockets: the promises at the top of `transport`; which weights replicas get."""
 
+import copy
 import socket
 import threading
 import time
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot import transport
-from accerl_lerobot.experience import Decision, Request, Tensors
+from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.trainer import worker
 from accerl_lerobot.trainer.worker import WeightPublisher
 from accerl_lerobot.transport import (
@@ -28,18 +29,20 @@ from tests.runs import eventually
 from tests.transport.played import PlayedClient
 
 LONG_S = 120.0
-HOSTS = [pytest.param(None, id="unix"), pytest.param("127.0.0.1", id="tcp")]
 
 
 class Service:
     """A service on a thread, which echoes, holds or fails as a message says."""
 
-    def __init__(self, host: str | None = None) -> None:
+    def __init__(self, host: str | None) -> None:
         self.held: list[PendingRequest] = []
         self.server = Server(self._take, host)
         self.over = False
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
+
+    def client(self) -> Client:
+        return Client("service", self.server.address)
 
     def _serve(self) -> None:
         while not self.over:
@@ -65,7 +68,7 @@ class Service:
             self.server.close()
 
 
-@pytest.fixture(params=HOSTS)
+@pytest.fixture(params=[None, "127.0.0.1"], ids=["unix", "tcp"])
 def service(request: pytest.FixtureRequest) -> Iterator[Service]:
     made = Service(request.param)
     yield made
@@ -99,10 +102,9 @@ def same(a: Any, b: Any) -> bool:
     return same(vars(a), vars(b)) if hasattr(a, "__dict__") else bool(a == b or a != a)
 
 
-def messages() -> list[Any]:
-    draw = np.random.default_rng(0)
-    image = draw.integers(0, 255, (96, 64, 3)).astype(np.uint8)
-    chunk = draw.normal(size=(4, 2)).astype(np.float32)
+def test_what_is_sent_arrives_whole_and_can_be_written_to(service: Service):
+    client, image = service.client(), np.arange(96 * 64 * 3, dtype=np.uint8).reshape(96, 64, 3)
+    chunk = np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32)
     arrays = {
         "strided": image[::2, :, 1],
         "turned": np.arange(12_000, dtype=np.float64).reshape(30, 400).T,
@@ -111,18 +113,13 @@ def messages() -> list[Any]:
         "other way round": np.arange(3000, dtype=">i4"),
     }
     observation = {"observation.images.front": image, "observation.state": chunk, "task": "öffne 🚪"}
-    return [
+    for message in (
         arrays,
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
         [Decision(chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], version=2**40)],
         [make_segment("a", 3), make_segment("b", 2)],
         [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
-    ]
-
-
-def test_what_is_sent_arrives_whole_and_can_be_written_to(service: Service):
-    client = Client("service", service.server.address)
-    for message in messages():
+    ):
         (reply,) = ask(client, ("echo", message))
         assert same(reply, message), message
     (reply,) = ask(client, ("echo", np.zeros(100_000)))
@@ -131,11 +128,10 @@ def test_what_is_sent_arrives_whole_and_can_be_written_to(service: Service):
 
 
 def test_replies_go_to_the_messages_they_answer_and_to_their_client(service: Service):
-    clients = [Client("service", service.server.address) for _ in range(3)]
+    clients = [service.client() for _ in range(3)]
     late = clients[0].send(("hold", "late"))
     assert ask(clients[0], *(("echo", i) for i in range(8))) == list(range(8))
     assert ask(clients[1], ("echo", "other")) == ["other"]
-    clients[1].close()
     clients[1].close()
     assert ask(clients[2], ("release", None), ("echo", 1)) == [None, 1]
     assert clients[0].done(LONG_S) == [(late, "late")] and clients[0].done(0.0) == []
@@ -143,7 +139,7 @@ def test_replies_go_to_the_messages_they_answer_and_to_their_client(service: Ser
 
 def test_many_large_messages_are_under_way_and_their_arrays_may_change(service: Service):
     """Neither end waits for the other to read first."""
-    client = Client("service", service.server.address)
+    client = service.client()
     sizes = [10, 300_000, 70, 5_000_000, 0, *[400_000] * 12]
     array = np.empty(max(sizes), np.uint8)
     tickets = []
@@ -170,31 +166,29 @@ def test_no_end_waits_for_one_that_reads_nothing(monkeypatch: pytest.MonkeyPatch
         server.poll(0.01)
         client.done(0.0)
     requests[0].answer(large)
-    replies: list[Any] = []
-    while not replies:
+    while not (replies := client.done(0.0)):
         server.poll(0.01)
-        replies = client.done(0.0)
     np.testing.assert_array_equal(replies[0][1], large)
     server.close()
 
 
 def test_a_client_learns_that_the_service_has_failed_or_is_gone(service: Service):
-    client = Client("service", service.server.address)
+    client = service.client()
     client.send(("fail", "it fell over"))
     with pytest.raises(ServiceStoppedError, match=r"service: .*it fell over"):
         client.done(LONG_S)
     client.send(("hold", 1))
-    new = Client("service", service.server.address)  # which may not have been served yet
+    new = service.client()  # which may not have been served yet
     service.close()
     for late in (client, new):
         with pytest.raises(ServiceStoppedError, match="service is gone"):
             late.done(LONG_S)
     with pytest.raises(ServiceStoppedError, match="service cannot be connected to"):
-        Client("service", service.server.address)
+        service.client()
 
 
 def test_what_a_client_that_is_gone_had_asked_is_forgotten(service: Service):
-    client = Client("service", service.server.address)
+    client = service.client()
     client.send(("hold", np.zeros(100_000)))
     ask(client, ("echo", None))
     (request,) = service.held
@@ -245,21 +239,20 @@ class MortalService:
         self.held: list[tuple[str, Future[Any]]] = []
         self.state = "there"
 
-    def become(self, state: str) -> None:
+    def lose(self, state: str) -> None:
         self.state = state
-        if state != "there":
-            for _, future in self.held:
-                future.set_exception(ServiceStoppedError("the service has stopped"))
-            self.held.clear()
+        while self.held:
+            self.held.pop()[1].set_exception(ServiceStoppedError("the service has stopped"))
 
     def connect(self, timeout_s: float = 0.0) -> Any:
         if self.state == "away":
             raise ServiceStoppedError("nobody listens there")
         return PlayedClient("inference", self._take)
 
-    def answer(self, number: int = 0) -> None:
-        message, future = self.held.pop(number)
-        future.set_result(f"answer to {message}")
+    def answer(self, *numbers: int) -> None:
+        for number in numbers:
+            message, future = self.held.pop(number)
+            future.set_result(f"answer to {message}")
 
     def _take(self, message: str) -> Future[Any]:
         if self.state == "dying":
@@ -268,55 +261,45 @@ class MortalService:
         return self.held[-1][1]
 
 
-@pytest.fixture(autouse=True)
-def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "RETRY_S", 0.0)
-
-
 @pytest.mark.parametrize("lost", ["away", "dying"])
-def test_what_was_not_answered_is_asked_again_in_order_and_under_the_same_ticket(lost: str):
+def test_what_was_not_answered_is_asked_again_in_order_and_under_the_same_ticket(
+    lost: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(transport, "RETRY_S", 0.0)
     service = MortalService()
     client = ReconnectingClient(service)
     a, b, c = (client.send(name) for name in "abc")
     service.answer(1)
     assert client.done(60.0) == [(b, "answer to b")]
-    service.become(lost)
+    service.lose(lost)
     assert client.done(0.0) == []
     d = client.send("d")  # while nobody is there
     assert client.done(0.0) == [] and not service.held
-    service.become("there")
+    service.state = "there"
     assert client.done(0.0) == [] and [message for message, _ in service.held] == ["a", "c", "d"]
-    for _ in range(3):
-        service.answer()
+    service.answer(0, 0, 0)
     assert sorted(client.done(60.0)) == [(a, "answer to a"), (c, "answer to c"), (d, "answer to d")]
 
 
-def copied(tensors: Tensors) -> Tensors:
-    """Copies as Ray's object store would have made them."""
-    return {name: tensor.copy() for name, tensor in tensors.items()}
-
-
-def test_a_replica_gets_the_newest_set_and_skips_those_before():
-    publisher, tensor = WeightPublisher(["inference"], copied), np.zeros(3)
+def test_a_replica_gets_the_newest_set_and_waits_for_a_newer_one_but_not_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    publisher, tensor = WeightPublisher(["inference"], copy.deepcopy), np.zeros(3)
     for version in range(5):
         tensor[:] = version
         publisher.publish(version, {"w": tensor})
     tensor[:] = -1
     version, (newest,) = publisher.newer_than("inference", -1)
     assert version == 4 and (newest["w"] == 4).all()
-
-
-def test_a_replica_waits_for_newer_weights_but_not_for_ever(monkeypatch: pytest.MonkeyPatch):
-    publisher = WeightPublisher(["inference"], copied)
-    threading.Timer(0.05, publisher.publish, (3, {})).start()
-    assert publisher.newer_than("inference", -1) == (3, [{}])
+    threading.Timer(0.05, publisher.publish, (5, {})).start()
+    assert publisher.newer_than("inference", 4) == (5, [{}])
     monkeypatch.setattr(worker, "ASK_S", 0.01)
-    assert publisher.newer_than("inference", 3) == (3, [])
+    assert publisher.newer_than("inference", 5) == (5, [])
 
 
 def test_flush_waits_until_each_replica_has_applied_the_newest(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(worker, "ASK_S", 0.0)
-    publisher = WeightPublisher(["inference 0", "inference 1"], copied)
+    publisher = WeightPublisher(["inference 0", "inference 1"], copy.deepcopy)
     publisher.flush(30)
     publisher.publish(1, {})
     publisher.newer_than("inference 0", 1)
