@@ -86,7 +86,7 @@ class Recorder:
     def __init__(
         self, environments: list[Environment], plans: list[EpisodePlan], config: RolloutConfig
     ) -> None:
-        self.plans = EpisodePlans(("push", "pull"), 0, None)
+        self.plans = EpisodePlans(("push", "pull", "match"), 0, None)
         self.plans.queue(plans)
         self.runner = RolloutRunner(environments, self.plans, config)
         self.segments, self.results = self.runner.segments, self.runner.results
