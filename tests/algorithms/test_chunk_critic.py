@@ -12,29 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import (
-    AWRConfig,
-    ChunkCriticConfig,
-    SelfImitationConfig,
-    chunk_critic,
-    off_policy,
-)
-from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig, chunk_critic
 from accerl_lerobot.algorithms.config import OffPolicyConfig, TrainerConfig
 from accerl_lerobot.algorithms.off_policy import Memory, OffPolicyUpdate, weights
 from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError, NonFiniteError
-from accerl_lerobot.experience import (
-    ENVIRONMENT_STATE,
-    TASK,
-    TASK_BITS,
-    Observation,
-    Request,
-    Segment,
-    SegmentStart,
-    stack_observations,
-)
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK_BITS, Request, Segment, stack_observations
 from accerl_lerobot.policies import teacher as teacher_module
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
@@ -45,7 +29,7 @@ from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig, StateModelConfig
+from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig
 from accerl_lerobot.world_model.latent import LatentModel
 from accerl_lerobot.world_model.states import SimulatorState, StateSpec
 from tests.replay.segments import make_segment
@@ -81,30 +65,23 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
         steps=np.full(t, 4),
         terminated=True,
         success=rewards[-1] > 0,
-        origin=SegmentStart("match", 0, 0),
     )
 
 
-def learner(
-    path: Path,
-    algorithm: ChunkCriticConfig | None = None,
-    model: StateModelConfig | None = None,
-    **trainer: Any,
-) -> ChunkCriticUpdate:
-    """A learner on the state of a simulator that tells one number, or on the state of another `model`."""
-    numbers, model = int(model is None), model or SimulatorStateConfig()
-    policy = PolicyConfig(path=str(path), device="cpu")
-    adapter = with_teacher(load_adapter, model, numbers, policy)
-    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return ChunkCriticUpdate(adapter, algorithm or ChunkCriticConfig(), config)
-
-
-def learning(path: Path, algorithm: OffPolicyConfig, **trainer: Any) -> Any:
-    """An update without a teacher."""
+def learning(path: Path, algorithm: OffPolicyConfig, model: Any = None, **trainer: Any) -> Any:
+    """An update, with a teacher where there is a `model` of the state."""
     torch.manual_seed(0)  # of the critic
-    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    policy, load = PolicyConfig(path=str(path), device="cpu"), load_adapter
+    if model is not None:
+        load = partial(with_teacher, load_adapter, model, int(isinstance(model, SimulatorStateConfig)))
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return make_update(adapter, algorithm, config)
+    return make_update(load(policy), algorithm, config)
+
+
+def learner(path: Path, model: Any = None, policy_steps: float = 0.25, **trainer: Any) -> Any:
+    """A learner on the state of a simulator that tells one number, or on the state of another `model`."""
+    algorithm = ChunkCriticConfig(gamma=GAMMA, policy_steps=policy_steps)
+    return learning(path, algorithm, model or SimulatorStateConfig(), **trainer)
 
 
 def new_teacher() -> Teacher:
@@ -121,10 +98,9 @@ def assert_equal(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) 
         np.testing.assert_array_equal(found[name], tensor, err_msg=name)
 
 
-def state_of(teacher: Teacher, observation: Observation) -> torch.Tensor:
+def state_of(teacher: Teacher, request: Request) -> torch.Tensor:
     """(1, S), at the beginning of an episode."""
-    observations, tasks = stack_observations([Request(observation=observation, noise_seed=0)])
-    return teacher.states(observations, tasks, np.zeros(1, np.float32))
+    return teacher.states(*stack_observations([request]), np.zeros(1, np.float32))
 
 
 def remember(memory: Memory, segment: Segment, **state: np.ndarray) -> None:
@@ -229,7 +205,7 @@ class TestActing:
         assert not acts[..., 1].any(), "evaluation is the policy's"
         np.testing.assert_array_equal(acts[:, 0, 0], acts[:, 1, 0])
         assert 70 < acts[:, 0, 0].sum() < 130
-        chunk = adapter.teacher(state_of(adapter.teacher, observation)).detach()
+        chunk = adapter.teacher(state_of(adapter.teacher, asked[0])).detach()
         wanted = adapter.processing.unnormalise(chunk)[0].numpy()
         for i, (decision, before) in enumerate(zip(adapter.decide(asked[:8], 0), own, strict=True)):
             expected = wanted if acts.reshape(-1)[i] else before.chunk
@@ -241,7 +217,7 @@ class TestActing:
         asked = [Request(observation=observation, noise_seed=i) for i in range(400)]
         chunk = teacher.replace(torch.zeros(400, 4, 2), asked)
         torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
-        noise = chunk - teacher(state_of(teacher, observation)).detach()
+        noise = chunk - teacher(state_of(teacher, asked[0])).detach()
         assert abs(float(noise.std()) - teacher_module.NOISE) < 0.02
 
 
@@ -257,7 +233,7 @@ def test_actions_are_normalised_as_they_are_unnormalised_and_constant_ones_are_0
 def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """On all rows of a memory of two episodes, in NumPy; noise is 1 throughout."""
     torch.manual_seed(0)
-    update = learner(tiny_checkpoint, ChunkCriticConfig(gamma=GAMMA), value_warmup_updates=9)
+    update = learner(tiny_checkpoint, value_warmup_updates=9)
     actions = np.random.default_rng(0).uniform(-1, 1, (2, 6, 4, 2)).astype(np.float32)
     rewards = [0.5, 0.0, -1.0, 0.0, 0.0]
     update.step([episode([*rewards, last], actions=a) for last, a in zip((1.0, -9.0), actions, strict=True)])
@@ -359,7 +335,7 @@ def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest
     update = learner(tiny_checkpoint, value_warmup_updates=9)
     segments = [episode([float(won)]) for won in (1, 1, 0, 0)]
     for seed, segment in enumerate(segments):
-        segment.origin = SegmentStart("match", seed, 0)
+        segment.origin = segment.origin._replace(seed=seed)
     monkeypatch.setattr(update.teacher, "plays", lambda episode: episode > 0)
     metrics = update.step(segments)
     assert (metrics["policy_success"], metrics["teacher_success"]) == (0.5, 0.0), "it is not ready"
@@ -370,7 +346,7 @@ def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest
 
 
 def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
-    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
+    update = learner(tiny_checkpoint, policy_steps=1.0)
     before = update.adapter.export_trainable()
     assert "imitation_loss" not in update.step([episode([0.0, 0.0])])
     assert_equal(update.adapter.export_trainable(), before)
@@ -392,10 +368,9 @@ def test_imitation_is_flow_matching():
 
 def first_action(update: OffPolicyUpdate) -> float:
     """Mean over noise of the first number that the policy does without exploring."""
-    state = np.zeros(4, np.float32)
-    observation: Any = {"observation.state": state, TASK: "Match the target", ENVIRONMENT_STATE: state[:1]}
-    observation |= {"observation.images.front": np.zeros((32, 32, 3), np.uint8)}
-    asked = [Request(observation=observation, noise_seed=i, explore=False) for i in range(64)]
+    seen: Any = {name: array[0] for name, array in episode([0.0]).observations.items()}
+    seen["task"] = "Match the target"
+    asked = [Request(observation=seen, noise_seed=i, explore=False) for i in range(64)]
     return float(np.mean([decision.chunk[0, 0] for decision in update.adapter.decide(asked, 0)]))
 
 
@@ -407,9 +382,10 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     """Reward is how far the first action goes up; the state says nothing. bf16 is emulated, and slow."""
     torch.manual_seed(0)
     monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
-    monkeypatch.setattr(off_policy, "POLICY_BATCH", 16)
+    monkeypatch.setattr("accerl_lerobot.algorithms.off_policy.POLICY_BATCH", 16)
     algorithm = ChunkCriticConfig(critic_steps=4.0, policy_steps=0.5)
-    update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
+    rates = {"lr": 1e-3, "value_lr": 1e-3, "value_warmup_updates": 2}
+    update = learning(tiny_checkpoint, algorithm, SimulatorStateConfig(), **rates)
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: precision == "bf16")
     automatic = PolicyConfig(path=str(tiny_checkpoint), device="cpu", precision="auto")
     update.adapter.precision, cast = load_adapter(automatic).precision, set()
@@ -528,7 +504,7 @@ def test_less_memory_gives_the_same_step(tiny_checkpoint: Path):
 
 
 def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
-    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
+    update = learner(tiny_checkpoint, policy_steps=1.0)
     before = update.adapter.export_trainable()
     torch.nn.init.constant_(update.teacher.network.biases[0], math.nan)
     with pytest.raises(NonFiniteError, match="5 steps in a row"):

@@ -185,19 +185,6 @@ def test_what_does_not_exist_is_never_looked_at(config: RatioConfig) -> None:
     assert (slope[~factors] == 0).all() and (slope[factors] != 0).any()
 
 
-def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
-    """μ = N(0, 1), π = N(m, s): samples, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in m."""
-    noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    mean = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    s = 1.2
-    policy = torch.distributions.Normal(mean, s)
-    logs = policy.log_prob(noise) - torch.distributions.Normal(0.0, 1.0).log_prob(noise)
-    kl = kl_from_behaviour(logs).mean()
-    assert kl.item() == pytest.approx(math.log(s) + (1 + 0.09) / (2 * s * s) - 0.5, rel=0.02)
-    (slope,) = torch.autograd.grad(kl, mean)
-    assert slope.item() == pytest.approx(0.3 / (s * s), rel=0.02)
-
-
 def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
     far = [-50.0, -1.0, 0.0, 1.0, KL_LINEAR_ABOVE, 50.0]
     logs = torch.tensor(far, dtype=torch.float64, requires_grad=True)
@@ -207,15 +194,11 @@ def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
     np.testing.assert_allclose(slope.numpy(), expected, atol=1e-12)
 
 
-def metrics_of(
-    log_ratio: list[float] = [0.0] * 4,
-    weight: list[float] = [1.0] * 4,
-    value: list[float] = [0.0] * 4,
-    returns: list[float] = [1.0] * 4,
-    keep: list[bool] = [True] * 4,
-) -> dict[str, float]:
+def metrics_of(**given: list[Any]) -> dict[str, float]:
     """Metrics of four decisions with a ratio each."""
-    samples = torch.tensor([log_ratio, weight, keep, value, returns], dtype=torch.float64).T
+    columns = {"log_ratio": [0.0] * 4, "weight": [1.0] * 4, "keep": [True] * 4}
+    columns |= {"value": [0.0] * 4, "returns": [1.0] * 4} | given
+    samples = torch.tensor(list(columns.values()), dtype=torch.float64).T
     return {name: metric.item() for name, metric in sample_metrics(samples).items()}
 
 
@@ -229,7 +212,7 @@ def test_effective_sample_size(weight: list[float], expected: float) -> None:
 
 def test_shares_are_of_the_ratios_that_exist_and_lag_is_of_decisions() -> None:
     logs = [math.log(rho) for rho in (0.7, 0.9, 1.1, 1.4)]
-    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0], keep=[True, True, True, False])
+    found = metrics_of(log_ratio=logs, weight=[0.0, 0.05, 1.0, 1.0], keep=[True, True, True, False])
     assert (found["clip_fraction"], found["low_weight"]) == pytest.approx((1 / 3, 2 / 3))
     assert found["approx_kl"] == pytest.approx(np.mean([math.exp(x) - 1 - x for x in logs[:3]]), abs=1e-6)
     assert lag_metrics(np.array([10, 9, 7]), 12) == pytest.approx({"lag_mean": 10 / 3, "lag_max": 5.0})

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several ranks make the updates that one makes, and go on from each other's checkpoints.
 
-Ranks are processes that talk through gloo on the loopback, one group of 2 and one of 3 for the whole module;
-PyTorch's collectives are real, so is FSDP2.
+Ranks are processes that talk through gloo on the loopback, one group for the whole module; PyTorch's
+collectives are real, so is FSDP2.
 """
 
 import math
@@ -26,8 +26,8 @@ OF_A_PART = ("ess", "explained_variance")
 """No means over decisions: what is reported is the mean over parts of the batch, as with micro-batches."""
 OF_RATIOS = ("approx_kl", "clip_fraction", "low_weight")
 """Means over ratios; the same where decisions have different numbers of them."""
-GROUPS = {2: ("whole", "broken", "counted"), 3: ("parts", "few")}
-RUNS = [(size, how, name) for size, names in GROUPS.items() for name in names for how in sharded.SHARDINGS]
+SIZE = 3
+RUNS = [(name, how) for name in sharded.cases() for how in sharded.SHARDINGS]
 
 
 @pytest.fixture(scope="module")
@@ -39,23 +39,20 @@ def alone() -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def folder(alone: dict[str, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of groups of 2 and of 3, from the beginning and from one rank's checkpoint."""
+    """Results of all ranks, from the beginning and from one rank's checkpoint."""
     directory = tmp_path_factory.mktemp("ranks")
     for name, result in alone.items():
         snapshot.save(directory / "alone" / name, result["half"])
-    for size, names in GROUPS.items():
-        (directory / str(size)).mkdir()
-        place = torch.multiprocessing.get_context("spawn").SimpleQueue()
-        arguments = (size, place, names, directory / "alone", directory / str(size))
-        torch.multiprocessing.spawn(sharded.work, arguments, nprocs=size)
+    place = torch.multiprocessing.get_context("spawn").SimpleQueue()
+    torch.multiprocessing.spawn(sharded.work, (SIZE, place, directory / "alone", directory), nprocs=SIZE)
     return directory
 
 
-@pytest.fixture(params=RUNS, ids=lambda run: f"{run[2]}-{run[1]}-{run[0]}")
+@pytest.fixture(params=RUNS, ids="-".join)
 def made(request: pytest.FixtureRequest, folder: Path) -> tuple[str, list[dict[str, Any]]]:
     """A case, and what every rank has made of it."""
-    size, how, name = request.param
-    return name, [snapshot.load(folder / str(size) / f"{name}-{how}-{rank}") for rank in range(size)]
+    name, how = request.param
+    return name, [snapshot.load(folder / f"{name}-{how}-{rank}") for rank in range(SIZE)]
 
 
 def assert_same(results: list[dict[str, Any]], expected: dict[str, Any], name: str) -> None:

@@ -107,17 +107,6 @@ def stage() -> Iterator[Callable[..., Stage]]:
         assert not one.thread.is_alive()
 
 
-def test_episodes_reach_replay_and_the_report_once_each(stage):
-    inserted: list[Segment] = []
-    one = stage(lambda segments: inserted.extend(segments) or True)
-    one.order(True, planned(10))
-    one.until(lambda: len(one.evaluated) >= 10 and len(one.episodes) >= 15)
-    assert sorted(one.evaluated) == list(range(10))
-    seeds = [e.plan.seed for e in one.episodes]
-    assert len(set(seeds)) == len(seeds), "an episode was reported twice or run twice"
-    assert len({s.key for s in inserted}) == len(inserted) > 0
-
-
 def test_exploring_pauses_while_replay_does_not_take_segments_and_evaluation_goes_on(stage):
     inserts: list[Future[bool]] = []
     one = stage(lambda segments: inserts.append(Future()) or inserts[-1], segment_length=1)

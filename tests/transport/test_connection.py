@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,6 @@ from accerl_lerobot.transport import (
 )
 from tests.replay.segments import make_segment
 from tests.runs import eventually
-from tests.transport.played import PlayedClient
 
 LONG_S = 120.0
 
@@ -232,53 +231,29 @@ def test_a_message_is_as_old_as_its_sender_says_if_that_can_be(monkeypatch: pyte
     server.close()
 
 
-class MortalService:
-    """Answers when the test says so; may be away, or die while it is asked."""
-
-    def __init__(self) -> None:
-        self.held: list[tuple[str, Future[Any]]] = []
-        self.state = "there"
-
-    def lose(self, state: str) -> None:
-        self.state = state
-        while self.held:
-            self.held.pop()[1].set_exception(ServiceStoppedError("the service has stopped"))
-
-    def connect(self, timeout_s: float = 0.0) -> Any:
-        if self.state == "away":
-            raise ServiceStoppedError("nobody listens there")
-        return PlayedClient("inference", self._take)
-
-    def answer(self, *numbers: int) -> None:
-        for number in numbers:
-            message, future = self.held.pop(number)
-            future.set_result(f"answer to {message}")
-
-    def _take(self, message: str) -> Future[Any]:
-        if self.state == "dying":
-            raise ServiceStoppedError("it dies")
-        self.held.append((message, Future()))
-        return self.held[-1][1]
-
-
-@pytest.mark.parametrize("lost", ["away", "dying"])
 def test_what_was_not_answered_is_asked_again_in_order_and_under_the_same_ticket(
-    lost: str, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(transport, "RETRY_S", 0.0)
-    service = MortalService()
-    client = ReconnectingClient(service)
-    a, b, c = (client.send(name) for name in "abc")
-    service.answer(1)
-    assert client.done(60.0) == [(b, "answer to b")]
-    service.lose(lost)
-    assert client.done(0.0) == []
-    d = client.send("d")  # while nobody is there
-    assert client.done(0.0) == [] and not service.held
-    service.state = "there"
-    assert client.done(0.0) == [] and [message for message, _ in service.held] == ["a", "c", "d"]
-    service.answer(0, 0, 0)
-    assert sorted(client.done(60.0)) == [(a, "answer to a"), (c, "answer to c"), (d, "answer to d")]
+    services = [Service(None)]
+    client: Any = ReconnectingClient(SimpleNamespace(connect=lambda timeout_s: services[-1].client()))
+    tickets = [client.send(message) for message in (("hold", "a"), ("echo", "b"), ("hold", "c"))]
+    assert client.done(LONG_S) == [(tickets[1], "b")]
+    services[-1].close()
+    assert client.done(LONG_S) == []
+    tickets += [client.send(("hold", "d"))]  # while nobody is there
+    for _ in range(2):  # the second one is lost as well
+        assert client.done(0.0) == []
+        services.append(Service(None))
+        assert client.done(0.0) == [] and eventually(lambda: len(services[-1].held) == 3)
+        assert [request.message[1] for request in services[-1].held] == ["a", "c", "d"]
+        if len(services) == 2:
+            services[-1].close()
+            assert client.done(LONG_S) == []
+    tickets += [client.send(("release", "e"))]
+    del tickets[1]
+    assert awaited(client, tickets) == ["a", "c", "d", "e"]
+    services[-1].close()
 
 
 def test_a_replica_gets_the_newest_set_and_waits_for_a_newer_one_but_not_for_ever(

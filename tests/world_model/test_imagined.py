@@ -97,15 +97,6 @@ def test_success_ends_it_and_pays_once_or_the_time_limit_ends_it(success_at: int
     assert last.rewards.tolist() == [0.0] * (K - 1) + [float(succeeds)]
 
 
-def test_an_episode_under_way_goes_on_from_its_state():
-    made, other = environment(CountingWorld()), environment(CountingWorld())
-    made.reset(3, "match")
-    made.step_chunk(CHUNK)
-    other.restore(made.state())
-    one, two = made.step_chunk(CHUNK).observation, other.step_chunk(CHUNK).observation
-    assert all(np.array_equal(one[name], two[name]) for name in (CAMERA, "observation.state"))
-
-
 def world() -> World:
     torch.manual_seed(0)
     return World(PixelWorldModel(SPEC, PixelModelConfig(channels=(8, 8))))
