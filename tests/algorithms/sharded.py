@@ -30,7 +30,6 @@ class Case(NamedTuple):
 
     algorithm: AlgorithmConfig
     config: dict[str, Any]
-    """Config of the trainer, apart from its ranks."""
     batches: list[list[Segment]]
 
 

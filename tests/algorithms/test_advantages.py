@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """GAE against a slow oracle and by hand; terminated is not truncated; normalised advantages."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from accerl_lerobot.algorithms.ratio_update import gae, moments, normalise
-from tests.rounding import assert_close
 
 LENGTHS = (7, 1, 3, 6, 2, 4)
 
@@ -47,21 +48,10 @@ def test_equals_the_oracle(gamma: float, lam: float) -> None:
         (False, [0.0625, 1.75], [0.5625, 2.0]),
     ],
 )
-def test_termination_and_truncation_by_hand(
-    terminated: bool, advantages: list[float], returns: list[float]
-) -> None:
+def test_termination_and_truncation_by_hand(terminated: bool, advantages: Any, returns: Any) -> None:
     reward, value = torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.25])
     found = gae(reward, value, torch.tensor([2.0]), torch.tensor([terminated]), [2], gamma=0.5, lam=0.5)
     assert [row.tolist() for row in found] == [advantages, returns]
-
-
-def test_parts_of_different_size_equal_the_whole() -> None:
-    x = torch.randn(40, generator=torch.Generator().manual_seed(0)) * 3 + 7
-    total = moments(x[:9]) + moments(x[9:])
-    torch.testing.assert_close(total, moments(x))
-    got = torch.cat([normalise(x[:9], total), normalise(x[9:], total)])
-    assert_close(got, (x - x.mean()) / x.std(correction=0))
-    assert got.dtype == x.dtype
 
 
 def test_equal_advantages_become_zero_and_a_large_mean_does_not_eat_the_variance() -> None:

@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -144,12 +145,6 @@ class TestMemory:
         assert ENVIRONMENT_STATE not in seen and seen["observation.state"].shape == (3, 4)
         np.testing.assert_array_equal(again["return"], memory["return"])
 
-    def test_a_part_of_an_episode_is_refused(self):
-        segment = episode([0.0, 0.0])
-        segment.terminated = False
-        with pytest.raises(InputError, match=r"rollout\.segment_length=2: .*whole episodes"):
-            remember(Memory(1000, GAMMA, n_step=2), segment)
-
 
 def slowly(ensemble: Ensemble, member: int, x: np.ndarray) -> np.ndarray:
     """Outputs of one member, in NumPy and float64."""
@@ -185,18 +180,14 @@ class TestActing:
         replica.load_trainable(trained.export_trainable())
         assert int(replica.teacher.model.seen) == 7
 
-    def test_whole_episodes_are_the_teachers_once_it_is_ready(
-        self, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-    ):
+    def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path, monkeypatch: Any):
         monkeypatch.setattr(teacher_module, "NOISE", 0.0)
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
         adapter = with_teacher(load_adapter, SimulatorStateConfig(), STATE_SIZE, config)
         observation = make_environment(ENV).reset(0, "match")
         asked = [
             Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
-            for episode in range(200)
-            for decision in (0, 1)
-            for explore in (True, False)
+            for episode, decision, explore in product(range(200), (0, 1), (True, False))
         ]
         assert not any(map(adapter.teacher.acts, asked)), "an untrained teacher does not act"
         own = adapter.decide(asked[:8], 0)
@@ -219,15 +210,6 @@ class TestActing:
         torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
         noise = chunk - teacher(state_of(teacher, asked[0])).detach()
         assert abs(float(noise.std()) - teacher_module.NOISE) < 0.02
-
-
-def test_actions_are_normalised_as_they_are_unnormalised_and_constant_ones_are_0(tiny_checkpoint: Path):
-    processing = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu")).processing
-    chunk = torch.randn(5, 4, 2)
-    torch.testing.assert_close(processing.normalise(processing.unnormalise(chunk)), chunk)
-    processing.postprocessor = lambda chunk: chunk * torch.tensor([0.5, 0.0]) + torch.tensor([1.0, 3.0])
-    chunk = torch.tensor([[[2.0, 3.0], [1.0, 4.0]]])
-    assert processing.normalise(chunk).tolist() == [[[2.0, 0.0], [0.0, 0.0]]]
 
 
 def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
@@ -295,9 +277,7 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
     assert float(found.detach()) == pytest.approx(0.5 * np.square(read - scaled(every)).mean(), rel=1e-3)
 
 
-def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
-    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_latent_state_is_computed_anew_when_its_model_changes(tiny_checkpoint: Path, monkeypatch: Any):
     monkeypatch.setattr(LatentModel, "first_steps", 8)
     monkeypatch.setattr(chunk_critic, "MOST_STATE_STEPS", 5)
     monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 4)
@@ -317,18 +297,16 @@ def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
     replaced = []
     for _ in range(7):
         acting = [parameter.detach().clone() for parameter in update.teacher.model.parameters()]
-        metrics = update.step([played(), played()])
+        update.step([played(), played()])
         now = list(update.teacher.model.parameters())
         replaced.append(any(not torch.equal(old, new) for old, new in zip(acting, now, strict=True)))
-        assert np.isfinite(metrics["world_model_contrast"])
         assert bool(update.teacher.ready) == (update.version > 2), "once its 8 first steps are made"
         seen = update.memory.observations(np.arange(len(update.memory)))
         states = update.teacher.states(*seen, update.memory["elapsed"])
         torch.testing.assert_close(torch.from_numpy(update.memory["state"]), states)
     assert replaced == [True, True, False, True, False, True, False], "every 12 decisions, 6 an update"
     assert update.memory["state"][:3, 4 + 4].tolist() == [0, 0.25, 0.5]
-    assert update.memory["last"][:6].tolist() == [False, False, True] * 2
-    assert update.state_learner is not None and update.state_learner.count == 8 + 5 * 3
+    assert update.state_learner.count == 8 + 5 * 3
 
 
 def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
@@ -459,9 +437,7 @@ def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: 
 
 
 @pytest.mark.parametrize("make", [learner, partial(learning, algorithm=AWRConfig())])
-def test_what_was_learnt_is_restored_to_the_last_bit(
-    make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path
-):
+def test_what_was_learnt_is_restored_to_the_last_bit(make: Callable[[Path], Any], tiny_checkpoint: Path):
     """On a latent state: see `test_resume_exact`."""
 
     def steps(update: OffPolicyUpdate, seed: int) -> dict[str, float]:

@@ -55,7 +55,6 @@ def gradient(inputs: LossInputs, loss: torch.Tensor) -> torch.Tensor:
 
 
 def measured(output: LossOutput) -> dict[str, torch.Tensor]:
-    """All metrics of a batch."""
     return output.means | sample_metrics(output.samples)
 
 

@@ -5,7 +5,6 @@ Ranks are processes that talk through gloo on the loopback, one group for the wh
 collectives are real, so is FSDP2.
 """
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.ranks import prepare, split_rows
+from accerl_lerobot.algorithms.ranks import prepare
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
 from tests.algorithms import sharded
@@ -32,14 +31,12 @@ RUNS = [(name, how) for name in sharded.cases() for how in sharded.SHARDINGS]
 
 @pytest.fixture(scope="module")
 def alone() -> dict[str, dict[str, Any]]:
-    """One rank's results for every case."""
     cases = sharded.cases().items()
     return {name: sharded.run(case, sharded.config_of(case, "ddp", 1)) for name, case in cases}
 
 
 @pytest.fixture(scope="module")
 def folder(alone: dict[str, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of all ranks, from the beginning and from one rank's checkpoint."""
     directory = tmp_path_factory.mktemp("ranks")
     for name, result in alone.items():
         snapshot.save(directory / "alone" / name, result["half"])
@@ -50,7 +47,6 @@ def folder(alone: dict[str, dict[str, Any]], tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture(params=RUNS, ids="-".join)
 def made(request: pytest.FixtureRequest, folder: Path) -> tuple[str, list[dict[str, Any]]]:
-    """A case, and what every rank has made of it."""
     name, how = request.param
     return name, [snapshot.load(folder / f"{name}-{how}-{rank}") for rank in range(SIZE)]
 
@@ -95,18 +91,6 @@ def test_ranks_know_the_same_to_the_last_bit(made: Any):
         for key, tensor in other["weights"].items():
             if tensor.size:  # else its part has gone to the first
                 np.testing.assert_array_equal(tensor, first["weights"][key])
-
-
-@pytest.mark.parametrize("ranks", [1, 2, 7])
-@pytest.mark.parametrize(("count", "size"), [(1, 5), (5, 2), (13, 3), (13, 100)])
-def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int, ranks: int):
-    rows = 100 + np.arange(count)
-    shares = [split_rows(rows, size, rank, ranks) for rank in range(ranks)]
-    assert {len(share) for share in shares} == {math.ceil(math.ceil(count / ranks) / size)}, "turns"
-    assert np.concatenate([part for share in shares for part, own in share if own]).tolist() == rows.tolist()
-    assert all(1 <= len(part) <= size for share in shares for part, _ in share)
-    sizes = [sum(len(part) for part, own in share if own) for share in shares]
-    assert max(sizes) - min(sizes) <= 1
 
 
 def test_a_policy_without_blocks_cannot_forget():

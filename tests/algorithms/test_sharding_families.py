@@ -33,8 +33,6 @@ SHARDED = {"ranks": 2, "sharding": "zero3"}
 
 
 class Case(NamedTuple):
-    """A policy, and what of it is shared out."""
-
     kind: str
     config: dict[str, Any] = SHARDED
     options: dict[str, Any] = {}

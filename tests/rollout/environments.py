@@ -22,13 +22,9 @@ CAMERA = "observation.images.front"
 class ScriptedEnvironment(Environment):
     """Every step earns 1; an episode ends after `steps` steps in the way `end` says.
 
-    ``observation.state`` is (seed, steps so far), which names every observation.
-
-    Args:
-        steps: length of an episode in env steps.
-        end: ``success`` (terminates), ``failure`` (terminates) or ``limit`` (truncates).
-        nan_at: step of an episode that is no number; 0 for never.
-        nan_in: what of it: its ``reward``, the ``state`` after it, or of the ``simulator``.
+    ``observation.state`` is (seed, steps so far), which names every observation. The way is ``success``,
+    ``failure`` (both terminate) or ``limit`` (truncates). At step `nan_at`, if it is not 0, the ``reward``,
+    the ``state`` or that of the ``simulator`` is no number.
     """
 
     def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0, nan_in: str = "reward") -> None:

@@ -13,7 +13,7 @@ import pytest
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
 from accerl_lerobot.experience import REAL
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, RolloutConfig, budgets, incarnation_after
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, RolloutConfig, incarnation_after
 from accerl_lerobot.seeds import train_seed
 from tests.rollout.environments import CHUNK, Recorder, ScriptedEnvironment, decide, evaluate, explore
 
@@ -212,10 +212,3 @@ def test_no_more_episodes_than_were_paid_for():
     assert take(plans, 2) == [evaluate(index=0)], "evaluations are not counted"
     endless = make()
     assert len(take(endless, 9)) == 9 and not endless.spent
-
-
-@pytest.mark.parametrize(
-    ("episodes", "workers", "shares"), [(7, 3, [3, 2, 2]), (1, 2, [1, 0]), (0, 2, [None, None])]
-)
-def test_a_budget_is_shared_among_workers(episodes: int, workers: int, shares: list[int | None]):
-    assert budgets(RolloutConfig(episodes=episodes, workers=workers)) == shares

@@ -4,7 +4,8 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,41 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResu
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
 from tests.rollout.environments import evaluate
 from tests.runs import HANGS_S, eventually
-from tests.transport.played import played
 
 WORLD = SimulatedConfig(max_steps=8, tolerance=0.05)
+
+
+class PlayedClient:
+    """A service of the test's own: its replies are what a function returns, or what comes into its future."""
+
+    def __init__(self, answer: Callable[[Any], Any]) -> None:
+        self._answer = answer
+        self._under_way: dict[int, Future[Any]] = {}
+        self._sent = 0
+
+    def send(self, message: Any, ticket: int | None = None) -> int:
+        answer = self._answer(message)
+        if not isinstance(answer, Future):
+            future: Future[Any] = Future()
+            future.set_result(answer)
+            answer = future
+        self._sent += 1
+        ticket = self._sent if ticket is None else ticket
+        self._under_way[ticket] = answer
+        return ticket
+
+    def done(self, timeout: float) -> list[tuple[int, Any]]:
+        wait(self._under_way.values(), timeout=timeout, return_when=FIRST_COMPLETED)
+        done = [ticket for ticket, future in self._under_way.items() if future.done()]
+        return [(ticket, self._under_way.pop(ticket).result()) for ticket in done]
+
+    def close(self) -> None:
+        self._under_way.clear()
+
+
+def played(answer: Callable[[Any], Any]) -> Any:
+    """An endpoint at which `answer` replies."""
+    return SimpleNamespace(name="played", connect=lambda *_: PlayedClient(answer))
 
 
 class OverError(Exception):
@@ -144,9 +177,7 @@ def test_an_insert_that_fails_ends_the_worker(stage):
 
 
 @pytest.mark.parametrize("in_environment", [True, False])
-def test_a_thread_that_hangs_shows_in_the_report(
-    stage, monkeypatch: pytest.MonkeyPatch, in_environment: bool
-):
+def test_a_thread_that_hangs_shows_in_the_report(stage, monkeypatch: Any, in_environment: bool):
     release = threading.Event()
     hanging = "rollout.step" if in_environment else "rollout.send"
 

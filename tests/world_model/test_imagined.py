@@ -103,7 +103,6 @@ def world() -> World:
 
 
 def test_a_batch_of_one_is_what_the_models_say():
-    """The environment's own calls, against the model's."""
     given = world().eval()
     made = environment(given, start(100))
     made.reset(0, "match")

@@ -105,16 +105,7 @@ def test_the_loss_by_hand(monkeypatch: pytest.MonkeyPatch):
     assert float(loss.detach()) == pytest.approx(sum(weights[k] * v for k, v in by_hand.items()), rel=1e-3)
 
 
-def test_a_state_is_latents_proprioception_and_time():
-    made, seen = model(), dots(np.array([[5, 5], [30, 40]]), np.arange(6, dtype=np.float32).reshape(2, 3))
-    state = made.encode(seen, ["a", "b"], np.array([0.25, 0.5], np.float32)).detach()
-    assert state.shape == (2, made.size) == (2, 8 + 3 + 1)
-    torch.testing.assert_close(state[:, :8].mean(1), torch.zeros(2), atol=1e-5, rtol=0)
-    assert state[:, 8:].tolist() == [[0, 1, 2, 0.25], [3, 4, 5, 0.5]]
-    assert not torch.allclose(state[0, :8], state[1, :8])
-
-
-def test_several_cameras_other_sizes_and_a_history_are_read():
+def test_a_state_is_latents_of_several_cameras_proprioception_with_a_history_and_time():
     spec = StateSpec(cameras={FRONT: 3, WRIST: 1}, state=6, environment_state=0, chunk=(2, 2))
     made, rng = model(spec), np.random.default_rng(0)
     seen = {
@@ -122,9 +113,12 @@ def test_several_cameras_other_sizes_and_a_history_are_read():
         WRIST: rng.integers(0, 256, (2, 2, 64, 64, 1), dtype=np.uint8),
         ROBOT: rng.standard_normal((2, 2, 3)).astype(np.float32),
     }
-    time = np.zeros(2, np.float32)
+    time = np.array([0.25, 0.5], np.float32)
     state = made.encode(seen, ["a", "b"], time).detach()
+    assert state.shape == (2, made.size) == (2, 8 + 6 + 1)
+    torch.testing.assert_close(state[:, :8].mean(1), torch.zeros(2), atol=1e-5, rtol=0)
     np.testing.assert_array_equal(state[:, 8:14], seen[ROBOT].reshape(2, 6))
+    assert state[:, 14].tolist() == time.tolist()
     for camera, frame in ((FRONT, 0), (FRONT, 1), (WRIST, 1)):
         other = seen | {camera: seen[camera].copy()}
         other[camera][:, frame] = 255 - other[camera][:, frame]

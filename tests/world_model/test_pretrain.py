@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -47,9 +48,7 @@ def check_again(demos: Path, trained: Path, again: Path, *more: str) -> int:
     return cli.main([*told, f"--dataset.root={demos}", f"--output_dir={again}", *more])
 
 
-def test_from_a_dataset_to_a_check_and_another_check(
-    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_from_a_dataset_to_a_check_and_another_check(demos: Path, tmp_path: Path, capsys: Any):
     out = tmp_path / "out"
     code = cli.main(arguments(demos, out, "--world_model.model.channels=16,24"))
     stdout, stderr = capsys.readouterr()
@@ -91,9 +90,7 @@ def forget() -> Iterator[Callable[[], None]]:
     forgotten()
 
 
-def test_a_model_of_another_package_is_learned_and_checked_by_naming_it(
-    forget: Callable[[], None], demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_model_of_another_package_is_named(forget: Any, demos: Path, tmp_path: Path, capsys: Any):
     out, again = tmp_path / "out", tmp_path / "again"
     cli.main(arguments(demos, out, *NAMED, "--world_model.steps=300", "--world_model.lr=0.03"))
     found = json.loads(capsys.readouterr().out)

@@ -102,9 +102,7 @@ def test_the_trainer_and_the_worker_may_be_on_different_devices(calls: Calls):
         assert len(learner.collect()) == 1
 
 
-def test_nobody_waits_while_steps_are_under_way_but_each_call_has_a_timeout(
-    calls: Calls, monkeypatch: pytest.MonkeyPatch
-):
+def test_nobody_waits_for_steps_but_each_call_has_a_timeout(calls: Calls, monkeypatch: pytest.MonkeyPatch):
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     _, there = learners(timeout_s=10.0)
@@ -143,7 +141,7 @@ class HastyTrainer(TrainerWorker):
 
 @pytest.mark.slow
 def test_a_run_on_a_state_that_another_process_learns(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: Any
 ):
     monkeypatch.setattr(trainer_worker, "TrainerWorker", HastyTrainer)
     config = off_policy_run(
