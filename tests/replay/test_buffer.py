@@ -45,16 +45,6 @@ def test_the_least_used_are_drawn_first():
     assert replay.counters.trained_decisions == 16 and replay.counters.unique_decisions == 8
 
 
-def test_whole_segments_until_there_are_enough():
-    replay = make_replay()
-    for i in range(5):
-        replay.insert(make_segment(f"k{i}", 3))
-    assert len(set(draw(replay, 7))) == 3
-    assert draw(replay, 7) == []  # 6 are left
-    assert replay.counters.trained_decisions == 9
-    assert len(draw(replay, 6)) == 2
-
-
 @pytest.mark.parametrize(("per_insert", "expected"), [(1.0, [1] * 8), (2.0, [2] * 8), (1.5, [1, 2] * 4)])
 def test_each_segment_is_drawn_as_often_as_its_share(per_insert: float, expected: list[int]):
     replay = make_replay(samples_per_insert=per_insert)

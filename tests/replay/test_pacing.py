@@ -87,6 +87,7 @@ class Simulation:
             assert self.replay.available_decisions < available
             return
         assert len({s.key for s in drawn}) == len(drawn)
+        assert self.batch <= sum(map(len, drawn)) < self.batch + len(drawn[-1]), "whole ones until enough"
         self.worst_lag = max(self.worst_lag, *(self.version - int(s.version.min()) for s in drawn))
         self.version += 1
         if self.version % self.publish_every == 0:

@@ -87,10 +87,10 @@ class Stage:
     def evaluated(self) -> list[int]:
         return [e.plan.index for e in self.episodes if not e.plan.explore]
 
-    def until(self, condition: Callable[[], bool], training: bool = True) -> None:
+    def until(self, condition: Callable[[], bool]) -> None:
         def happened() -> bool:
             assert self.failure is None
-            self.order(training)
+            self.order(True)
             return condition()
 
         assert eventually(happened, HANGS_S)
@@ -157,14 +157,6 @@ def test_exploring_pauses_while_replay_does_not_take_segments_and_evaluation_goe
     for future in inserts:
         future.set_result(True)
     one.until(lambda: one.explored > explored)
-
-
-def test_the_end_of_training_abandons_its_episodes_and_frees_their_slots(stage):
-    shut: list[Future[bool]] = []
-    one = stage(lambda segments: shut.append(Future()) or shut[-1])
-    one.until(lambda: len(shut) >= MAX_PENDING)
-    one.order(False, planned(6))
-    one.until(lambda: len(one.evaluated) == 6, training=False)
 
 
 def test_an_insert_that_fails_ends_the_worker(stage):

@@ -15,9 +15,6 @@ from accerl_lerobot.trainer.worker import Peers
 
 
 class LightRank:
-    def ready(self) -> bool:
-        return True
-
     def step(self, how: str) -> None:
         if how == "dies":
             os._exit(1)
@@ -32,7 +29,7 @@ class LightRank:
 )
 def test_a_rank_that_is_lost_ends_the_wait(light_ray: None, how: str, error: str):
     actor: Any = ray.remote(LightRank).options(num_cpus=0).remote()
-    assert ray.get(actor.ready.remote())
+    assert ray.get(actor.__ray_ready__.remote())
     peers = Peers([actor], TrainerConfig(ranks=2), 2.0)
     with peers.joining("step", "fine"):
         pass

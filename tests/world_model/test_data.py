@@ -17,15 +17,7 @@ from accerl_lerobot.engines.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import contract
-from accerl_lerobot.world_model.contract import (
-    Episode,
-    Windows,
-    WindowStart,
-    WorldModelSpec,
-    cut_windows,
-    load_episodes,
-    starts_of,
-)
+from accerl_lerobot.world_model.contract import Episode, WindowStart, WorldModelSpec, cut_windows
 from tests.tiny_datasets import record_dataset
 
 K = 3
@@ -35,19 +27,19 @@ SPEC = WorldModelSpec(
 
 
 def an_episode(steps: int, times: Sequence[int] | None = None, success: bool = False) -> Episode:
-    """Frame and state say which env step they show, by default each but the last; action i is (i, −i)."""
+    """Frame and state say which env step they show, by default each but the last; action i is (i, −1 − i)."""
     at = np.arange(steps) if times is None else np.array(times)
     return Episode(
         frames=np.broadcast_to(at[:, None, None, None, None], (len(at), 1, 2, 2, 3)).astype(np.uint8),
         times=at,
         state=at[:, None].astype(np.float32),
-        actions=np.stack([np.arange(steps), -np.arange(steps)], 1).astype(np.float32),
+        actions=np.stack([np.arange(steps), -1 - np.arange(steps)], 1).astype(np.float32),
         success=success,
         task="go",
     )
 
 
-def cut(episode: Episode, frame: int, chunks: int | None) -> Windows:
+def cut(episode: Episode, frame: int, chunks: int | None) -> Any:
     return cut_windows([WindowStart(episode, frame)], SPEC, chunks)
 
 
@@ -64,12 +56,7 @@ def test_a_window_inside_an_episode():
     assert windows.actions[0, :, :, 0].tolist() == [[7, 8, 9], [10, 11, 12]]
     assert windows.steps.tolist() == [[3, 3]] and windows.known.all() and not windows.success.any()
     assert windows.tasks == ("go",) and shown(context.first_frame) == 0 == context.first_robot.item()
-    assert context.commanded_sum.tolist() == [[21, -21]], "actions 0 to 6"
-
-
-def test_the_context_stops_at_the_first_frame():
-    context = cut(an_episode(20), 2, 1).context
-    assert shown(context.frames) == [0, 2] and context.actions[0, :, 1].tolist() == [0, 0, -1]
+    assert context.commanded_sum.tolist() == [[21, -28]], "actions 0 to 6"
 
 
 def test_an_episode_that_ends_within_a_chunk_repeats_its_last_frame_and_action():
@@ -83,9 +70,10 @@ def test_an_episode_that_ends_within_a_chunk_repeats_its_last_frame_and_action()
 
 def test_an_episode_with_a_frame_for_each_decision():
     episode = an_episode(8, [0, 3, 6, 8], success=True)
-    assert len(starts_of([episode, episode])) == 6
+    assert len(contract.starts_of([episode, episode])) == 6
     whole, third = cut(episode, 0, None), cut(episode, 2, 2)
     assert shown(whole.context.frames) == [0, 0] and shown(whole.frames) == [3, 6, 8]
+    assert not whole.context.actions.any(), "there were none before"
     assert whole.steps.tolist() == [[3, 3, 2]] and whole.success.tolist() == [[False, False, True]]
     assert shown(third.context.frames) == [3, 6] and shown(third.frames) == [8, 8]
     assert third.known.tolist() == [[True, False]] == third.success.tolist()
@@ -97,7 +85,7 @@ def test_every_frame_and_action_is_the_dataset_s_once(tmp_path: Path):
     dataset = record_dataset(tmp_path / "once", env, episodes=6, failure_share=0.5)
     rows = LeRobotDataset("a/b", root=dataset.root)
     merge_datasets([rows, rows], output_repo_id="a/b", output_dir=tmp_path / "twice")
-    episodes = load_episodes(replace(dataset, root=str(tmp_path / "twice")), SPEC)
+    episodes = contract.load_episodes(replace(dataset, root=str(tmp_path / "twice")), SPEC)
     assert len(episodes) == 6 and sum(len(episode.actions) for episode in episodes) == len(rows)
     index = 0
     for episode in episodes:

@@ -2,7 +2,6 @@
 """The networks on an environment of one dot that goes where it is told, their training and their check."""
 
 import copy
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -15,16 +14,7 @@ from torch import Tensor
 from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.contract import (
-    Context,
-    Episode,
-    Prediction,
-    State,
-    Windows,
-    WindowStart,
-    WorldModelSpec,
-    cut_windows,
-)
+from accerl_lerobot.world_model.contract import Episode, Prediction, WindowStart, WorldModelSpec, cut_windows
 from accerl_lerobot.world_model.imagined import World
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import auroc, check, choose_threshold, skill_and_sensitivity
@@ -81,13 +71,13 @@ def model(channels: tuple[int, ...] = (24, 32)) -> PixelWorldModel:
     return PixelWorldModel(SPEC, PixelModelConfig(channels=channels))
 
 
-def windows(episodes: list[Episode], chunks: int = 3) -> Windows:
+def windows(episodes: list[Episode], chunks: int = 3) -> Any:
     last = [len(episode.frames) - K * chunks for episode in episodes]
     at = [WindowStart(e, frame) for e, most in zip(episodes, last, strict=True) for frame in range(most)]
     return cut_windows(at, SPEC, chunks)
 
 
-def rollout(made: PixelWorldModel, of: Windows) -> list[Prediction]:
+def rollout(made: PixelWorldModel, of: Any) -> list[Prediction]:
     state, predictions = made.begin(of.context, of.tasks), []
     for chunk in range(of.actions.shape[1]):
         predictions.append(made.step(state, of.actions[:, chunk]))
@@ -118,7 +108,7 @@ def test_a_new_model_is_a_copy_of_the_last_frame_of_each_camera():
 def test_a_rollout_depends_on_its_row_alone():
     of, made = windows(dots(2), chunks=2), awake(model())
     together = rollout(made, of)[0]
-    context = Context(*(tensor[3:4] for tensor in of.context))
+    context = of.context._make(tensor[3:4] for tensor in of.context)
     alone = made.step(made.begin(context, of.tasks[3:4]), of.actions[3:4, 0])
     assert (alone.frames.int() - together.frames[3:4].int()).abs().max() <= 1, "rounding"
     assert_close(alone.robot, together.robot[3:4])
@@ -136,7 +126,7 @@ def test_a_state_is_not_changed_by_going_on_from_it():
     assert_close(first.state["commanded_sum"], state["commanded_sum"] + of.actions[:, 0].sum(1))
 
 
-def loss(made: PixelWorldModel, of: Windows) -> float:
+def loss(made: PixelWorldModel, of: Any) -> float:
     torch.manual_seed(0)
     return made.loss(of)[0].item()
 
@@ -234,10 +224,10 @@ class Deterministic:
     def __init__(self, kind: str) -> None:
         self.kind = kind
 
-    def begin(self, context: Context, tasks: Sequence[str]) -> State:
+    def begin(self, context: Any, tasks: Any) -> dict[str, Tensor]:
         return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
-    def step(self, state: State, actions: Tensor) -> Prediction:
+    def step(self, state: dict[str, Tensor], actions: Tensor) -> Prediction:
         robot, frames = state["robot"], state["frames"]
         if self.kind != "still":
             moves = 2 * actions if self.kind == "exact" else torch.full_like(actions, 0.4)
