@@ -40,15 +40,12 @@ class LinearAdapter(PolicyAdapter):
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         raise NotImplementedError
 
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Any, tasks: Sequence[str], latent: dict[str, Tensor]) -> Evaluation:
         assert len(tasks) == len(observations[STATE]) == len(latent["x"])
         state = torch.from_numpy(observations[STATE])
         z = (latent["x"] - state @ self.weight.T) / STD
-        entropy = torch.zeros(len(state))
         value = self.value_head(state)[:, 0]
-        return Evaluation(log_prob=-0.5 * z * z, entropy=entropy, value=value)
+        return Evaluation(log_prob=-0.5 * z * z, entropy=torch.zeros(len(state)), value=value)
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import faulthandler
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +30,6 @@ class Case(NamedTuple):
 
     algorithm: AlgorithmConfig
     config: dict[str, Any]
-    """Config of the trainer, apart from its ranks."""
     batches: list[list[Segment]]
 
 
@@ -47,9 +45,7 @@ def run(case: Case, config: TrainerConfig, state: Any = None) -> dict[str, Any]:
         adapter.load_trainable(state["weights"])
         update.restore(state["update"])
     half, metrics = state, []
-    for number, batch in enumerate(case.batches):
-        if number < update.version:
-            continue
+    for batch in case.batches[update.version :]:
         metrics.append(update.step(batch))
         if update.version == len(case.batches) // 2:
             half = {"weights": adapter.export_trainable(), "update": update.state()}
@@ -88,13 +84,12 @@ def cases() -> dict[str, Case]:
     }
 
 
-def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, results: Path) -> None:
-    """One rank: every named case, in every way of sharing, from the beginning and from one rank's state."""
+def work(rank: int, size: int, place: Any, states: Path, results: Path) -> None:
+    """One rank: every case, in every way of sharing, from the beginning and from one rank's state."""
     faulthandler.enable()
     torch.set_num_threads(1)
     join(rank, size, place)
-    for name in names:
-        case = cases()[name]
+    for name, case in cases().items():
         for sharding in SHARDINGS:
             config = config_of(case, sharding, size)
             result = run(case, config)

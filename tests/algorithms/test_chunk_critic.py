@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,29 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import (
-    AWRConfig,
-    ChunkCriticConfig,
-    SelfImitationConfig,
-    chunk_critic,
-    off_policy,
-)
-from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig, chunk_critic
 from accerl_lerobot.algorithms.config import OffPolicyConfig, TrainerConfig
 from accerl_lerobot.algorithms.off_policy import Memory, OffPolicyUpdate, weights
 from accerl_lerobot.algorithms.update import make_update
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError, NonFiniteError
-from accerl_lerobot.experience import (
-    ENVIRONMENT_STATE,
-    TASK,
-    TASK_BITS,
-    Observation,
-    Request,
-    Segment,
-    SegmentStart,
-    stack_observations,
-)
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Request, Segment, stack_observations
 from accerl_lerobot.policies import teacher as teacher_module
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
@@ -45,7 +30,7 @@ from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig, StateModelConfig
+from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig
 from accerl_lerobot.world_model.latent import LatentModel
 from accerl_lerobot.world_model.states import SimulatorState, StateSpec
 from tests.replay.segments import make_segment
@@ -81,54 +66,43 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
         steps=np.full(t, 4),
         terminated=True,
         success=rewards[-1] > 0,
-        origin=SegmentStart("match", 0, 0),
     )
 
 
-def chunks(segment: Segment) -> np.ndarray:
-    return np.zeros((len(segment), 4, 2), np.float32)
-
-
-def learner(
-    path: Path,
-    algorithm: ChunkCriticConfig | None = None,
-    model: StateModelConfig | None = None,
-    **trainer: Any,
-) -> ChunkCriticUpdate:
-    """A learner on the state of a simulator that tells one number, or on the state of another `model`."""
-    numbers, model = int(model is None), model or SimulatorStateConfig()
-    policy = PolicyConfig(path=str(path), device="cpu")
-    adapter = with_teacher(load_adapter, model, numbers, policy)
-    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return ChunkCriticUpdate(adapter, algorithm or ChunkCriticConfig(), config)
-
-
-latent_learner = partial(learner, model=LatentConfig(latents=4))
-
-
-def learning(path: Path, algorithm: OffPolicyConfig, **trainer: Any) -> Any:
-    """An update without a teacher."""
+def learning(path: Path, algorithm: OffPolicyConfig, model: Any = None, **trainer: Any) -> Any:
+    """An update, with a teacher where there is a `model` of the state."""
     torch.manual_seed(0)  # of the critic
-    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    policy, load = PolicyConfig(path=str(path), device="cpu"), load_adapter
+    if model is not None:
+        load = partial(with_teacher, load_adapter, model, int(isinstance(model, SimulatorStateConfig)))
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return make_update(adapter, algorithm, config)
+    return make_update(load(policy), algorithm, config)
 
 
-def simulator(numbers: int) -> SimulatorState:
-    """The state of a simulator that tells so many numbers."""
-    return SimulatorState(StateSpec({}, 4, numbers, (4, 2)), SimulatorStateConfig())
+def learner(path: Path, model: Any = None, policy_steps: float = 0.25, **trainer: Any) -> Any:
+    """A learner on the state of a simulator that tells one number, or on the state of another `model`."""
+    algorithm = ChunkCriticConfig(gamma=GAMMA, policy_steps=policy_steps)
+    return learning(path, algorithm, model or SimulatorStateConfig(), **trainer)
 
 
-def state_of(teacher: Teacher, observation: Observation) -> torch.Tensor:
+def assert_equal(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    for name, tensor in expected.items():
+        np.testing.assert_array_equal(found[name], tensor, err_msg=name)
+
+
+def state_of(teacher: Teacher, request: Request) -> torch.Tensor:
     """(1, S), at the beginning of an episode."""
-    observations, tasks = stack_observations([Request(observation=observation, noise_seed=0)])
-    return teacher.states(observations, tasks, np.zeros(1, np.float32))
+    return teacher.states(*stack_observations([request]), np.zeros(1, np.float32))
+
+
+def remember(memory: Memory, segment: Segment, **state: np.ndarray) -> None:
+    memory.add(segment, np.zeros((len(segment), 4, 2), np.float32), **state)
 
 
 class TestMemory:
     def test_targets_of_an_episode_by_hand(self):
         memory = Memory(1000, GAMMA, n_step=2)
-        memory.add(episode([0.0, 1.0, 0.0, 2.0]), chunks(episode([0.0] * 4)))
+        remember(memory, episode([0.0, 1.0, 0.0, 2.0]))
         np.testing.assert_allclose(memory["return"], [0.9 + 2 * 0.729, 1 + 2 * 0.81, 1.8, 2.0], rtol=1e-6)
         np.testing.assert_allclose(memory["reward"], [0.9, 1.0, 1.8, 2.0], rtol=1e-6, atol=1e-7)
         np.testing.assert_allclose(memory["discount"], [0.81, 0.81, 0.0, 0.0], rtol=1e-6)
@@ -139,7 +113,7 @@ class TestMemory:
         memory = Memory(10, GAMMA, n_step=2)
         for first in range(0, 100, 10):
             segment = episode([0.0] * 4, first=first)
-            memory.add(segment, chunks(segment), state=segment.observations[ENVIRONMENT_STATE][:-1])
+            remember(memory, segment, state=segment.observations[ENVIRONMENT_STATE][:-1])
             bootstraps = np.flatnonzero(memory["discount"])
             now = memory["state"][bootstraps, 0]
             then = memory["state"][memory["following"][bootstraps], 0]
@@ -152,47 +126,29 @@ class TestMemory:
         for name in ("open the door", "close the door"):
             segment = episode([0.0, 1.0])
             segment.task = name
-            memory.add(segment, chunks(segment))
+            remember(memory, segment)
         again = Memory(1000, GAMMA, n_step=2)
         again.restore(memory.state())
         for each in (memory, again):
-            each.add(episode([1.0]), chunks(episode([1.0])))
+            remember(each, episode([1.0]))
         seen, tasks = again.observations(np.array([0, 3, 4]))
         assert tasks == ["open the door", "close the door", "Match the target"]
         assert ENVIRONMENT_STATE not in seen and seen["observation.state"].shape == (3, 4)
         np.testing.assert_array_equal(again["return"], memory["return"])
 
-    def test_a_part_of_an_episode_is_refused(self):
-        segment = episode([0.0, 0.0])
-        segment.terminated = False
-        with pytest.raises(InputError, match=r"rollout\.segment_length=2: .*whole episodes"):
-            Memory(1000, GAMMA, n_step=2).add(segment, chunks(segment))
-
 
 def slowly(ensemble: Ensemble, member: int, x: np.ndarray) -> np.ndarray:
     """Outputs of one member, in NumPy and float64."""
     h = x.astype(np.float64)
-    weights, biases = (
-        [p[member].detach().double().numpy() for p in all_] for all_ in (ensemble.weights, ensemble.biases)
-    )
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+    layers = [
+        [p[member].detach().double().numpy() for p in layer]
+        for layer in zip(ensemble.weights, ensemble.biases, strict=True)
+    ]
+    for weight, bias in layers[:-1]:
         h = h @ weight + bias
         h = (h - h.mean(1, keepdims=True)) / np.sqrt(h.var(1, keepdims=True) + 1e-5)
         h = h / (1 + np.exp(-h))
-    return h @ weights[-1] + biases[-1]
-
-
-def test_a_teacher_keeps_to_its_range():
-    torch.manual_seed(0)
-    teacher = Teacher(simulator(2), chunk=(3, 2))
-    with torch.no_grad():
-        teacher.low.copy_(torch.tensor([-1.0, 2.0]))
-        teacher.high.copy_(torch.tensor([0.0, 4.0]))
-        teacher.network.weights[-1].mul_(1000)
-    chunk = teacher(100 * torch.randn(50, 2 + TASK_BITS)).detach()
-    assert chunk.shape == (50, 3, 2)
-    assert (chunk.amin((0, 1)) >= teacher.low).all() and (chunk.amax((0, 1)) <= teacher.high).all()
-    assert chunk[..., 1].max() > 3.9 and chunk[..., 0].min() < -0.9
+    return h @ layers[-1][0] + layers[-1][1]
 
 
 class TestActing:
@@ -204,74 +160,54 @@ class TestActing:
         replica.load_trainable(trained.export_trainable())
         assert int(replica.teacher.model.seen) == 7
 
-    def test_whole_episodes_are_the_teachers_once_it_is_ready(
-        self, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-    ):
+    def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path, monkeypatch: Any):
         monkeypatch.setattr(teacher_module, "NOISE", 0.0)
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-        model = SimulatorStateConfig()
-        adapter = with_teacher(load_adapter, model, STATE_SIZE, config)
-        assert adapter.teacher is not None
+        adapter = with_teacher(load_adapter, SimulatorStateConfig(), STATE_SIZE, config)
         observation = make_environment(ENV).reset(0, "match")
         asked = [
             Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
-            for episode in range(200)
-            for decision in (0, 1)
-            for explore in (True, False)
+            for episode, decision, explore in product(range(200), (0, 1), (True, False))
         ]
         assert not any(map(adapter.teacher.acts, asked)), "an untrained teacher does not act"
         own = adapter.decide(asked[:8], 0)
-        with torch.no_grad():
-            adapter.teacher.ready.fill_(1)
+        adapter.teacher.ready.fill_(1)
         acts = np.array(list(map(adapter.teacher.acts, asked))).reshape(200, 2, 2)
         assert not acts[..., 1].any(), "evaluation is the policy's"
         np.testing.assert_array_equal(acts[:, 0, 0], acts[:, 1, 0])
         assert 70 < acts[:, 0, 0].sum() < 130
-        state = state_of(adapter.teacher, observation)
-        assert state.shape == (1, STATE_SIZE + TASK_BITS)
-        wanted = adapter.processing.unnormalise(adapter.teacher(state).detach())[0].numpy()
+        chunk = adapter.teacher(state_of(adapter.teacher, asked[0])).detach()
+        wanted = adapter.processing.unnormalise(chunk)[0].numpy()
         for i, (decision, before) in enumerate(zip(adapter.decide(asked[:8], 0), own, strict=True)):
             expected = wanted if acts.reshape(-1)[i] else before.chunk
             np.testing.assert_allclose(decision.chunk, expected, atol=1e-6)
 
     def test_its_noise_belongs_to_the_request(self, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(teacher_module, "SHARE", 1.0)
-        teacher = Teacher(simulator(STATE_SIZE), chunk=(4, 2))
-        with torch.no_grad():
-            teacher.ready.fill_(1)
-        observation = make_environment(ENV).reset(0, "match")
+        spec, observation = StateSpec({}, 4, STATE_SIZE, (4, 2)), make_environment(ENV).reset(0, "match")
+        teacher = Teacher(SimulatorState(spec, SimulatorStateConfig()), chunk=(4, 2))
+        teacher.ready.fill_(1)
         asked = [Request(observation=observation, noise_seed=i) for i in range(400)]
         chunk = teacher.replace(torch.zeros(400, 4, 2), asked)
         torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
-        noise = chunk - teacher(state_of(teacher, observation)).detach()
+        noise = chunk - teacher(state_of(teacher, asked[0])).detach()
         assert abs(float(noise.std()) - teacher_module.NOISE) < 0.02
-
-
-def test_actions_are_normalised_as_they_are_unnormalised_and_constant_ones_are_0(tiny_checkpoint: Path):
-    processing = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu")).processing
-    chunk = torch.randn(5, 4, 2)
-    torch.testing.assert_close(processing.normalise(processing.unnormalise(chunk)), chunk)
-    processing.postprocessor = lambda chunk: chunk * torch.tensor([0.5, 0.0]) + torch.tensor([1.0, 3.0])
-    chunk = torch.tensor([[[2.0, 3.0], [1.0, 4.0]]])
-    assert processing.normalise(chunk).tolist() == [[[2.0, 0.0], [0.0, 0.0]]]
 
 
 def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """On all rows of a memory of two episodes, in NumPy; noise is 1 throughout."""
     torch.manual_seed(0)
-    update = learner(tiny_checkpoint, ChunkCriticConfig(gamma=GAMMA), value_warmup_updates=9)
+    update = learner(tiny_checkpoint, value_warmup_updates=9)
     actions = np.random.default_rng(0).uniform(-1, 1, (2, 6, 4, 2)).astype(np.float32)
-    played = [
-        episode([0.5, 0.0, -1.0, 0.0, 0.0, last], actions=a)
-        for last, a in zip((1.0, -9.0), actions, strict=True)
-    ]
-    update.step(played)
+    rewards = [0.5, 0.0, -1.0, 0.0, 0.0]
+    update.step([episode([*rewards, last], actions=a) for last, a in zip((1.0, -9.0), actions, strict=True)])
     memory, teacher = update.memory, update.teacher
     update._scale_states()
     with torch.no_grad():
         for weight in (update.critic.network.weights[-1], update.slow.network.weights[-1]):
             weight.mul_(100)
         update.slow.network.biases[-1].add_(0.5)
+        teacher.low.copy_(torch.tensor([-2.0, 0.5]))
     every = np.arange(12)
     monkeypatch.setattr(chunk_critic, "drawn", lambda among, _: among)
     monkeypatch.setattr(torch, "randn_like", torch.ones_like)
@@ -285,7 +221,8 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
         return ((states[rows] - states.mean(0)) / np.maximum(states.std(0), 1e-3)).clip(-10, 10)
 
     def planned(rows: np.ndarray) -> np.ndarray:
-        return np.tanh(slowly(teacher.network, 0, scaled(rows))).reshape(-1, 4, 2)
+        share = (1 + np.tanh(slowly(teacher.network, 0, scaled(rows))).reshape(-1, 4, 2)) / 2
+        return np.array([-2.0, 0.5]) * (1 - share) + share  # the range of the actions
 
     def valued(critic: chunk_critic.Critic, rows: np.ndarray, chunk: np.ndarray) -> np.ndarray:
         seen = np.concatenate([scaled(rows), chunk.reshape(len(rows), 8)], 1)
@@ -324,15 +261,13 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
     assert float(found.detach()) == pytest.approx(0.5 * np.square(read - scaled(every)).mean(), rel=1e-3)
 
 
-def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
-    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_latent_state_is_computed_anew_when_its_model_changes(tiny_checkpoint: Path, monkeypatch: Any):
     monkeypatch.setattr(LatentModel, "first_steps", 8)
     monkeypatch.setattr(chunk_critic, "MOST_STATE_STEPS", 5)
     monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 4)
     monkeypatch.setattr(chunk_critic, "REFRESH", 12)
     torch.manual_seed(0)
-    update, rng = latent_learner(tiny_checkpoint), np.random.default_rng(0)
+    update, rng = learner(tiny_checkpoint, model=LatentConfig(latents=4)), np.random.default_rng(0)
 
     def played() -> Segment:
         segment = episode([0.0, 0.0, 1.0], actions=rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32))
@@ -341,49 +276,42 @@ def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
         segment.time_limit = 16
         return segment
 
-    def states_of_now() -> torch.Tensor:
-        observations = update.memory.observations(np.arange(len(update.memory)))
-        return update.teacher.states(*observations, update.memory["elapsed"])
-
     metrics = update.step([played()])
     assert not any(name.startswith("world_model") for name in metrics), "two transitions are too few"
-    assert not update.teacher.ready
     replaced = []
     for _ in range(7):
         acting = [parameter.detach().clone() for parameter in update.teacher.model.parameters()]
-        metrics = update.step([played(), played()])
+        update.step([played(), played()])
         now = list(update.teacher.model.parameters())
         replaced.append(any(not torch.equal(old, new) for old, new in zip(acting, now, strict=True)))
-        assert np.isfinite(metrics["world_model_contrast"])
         assert bool(update.teacher.ready) == (update.version > 2), "once its 8 first steps are made"
-        torch.testing.assert_close(torch.from_numpy(update.memory["state"]), states_of_now())
+        seen = update.memory.observations(np.arange(len(update.memory)))
+        states = update.teacher.states(*seen, update.memory["elapsed"])
+        torch.testing.assert_close(torch.from_numpy(update.memory["state"]), states)
     assert replaced == [True, True, False, True, False, True, False], "every 12 decisions, 6 an update"
     assert update.memory["state"][:3, 4 + 4].tolist() == [0, 0.25, 0.5]
-    assert update.memory["last"][:6].tolist() == [False, False, True] * 2
-    assert update.state_learner is not None and update.state_learner.count == 8 + 5 * 3
+    assert update.state_learner.count == 8 + 5 * 3
 
 
 def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     update = learner(tiny_checkpoint, value_warmup_updates=9)
     segments = [episode([float(won)]) for won in (1, 1, 0, 0)]
     for seed, segment in enumerate(segments):
-        segment.origin = SegmentStart("match", seed, 0)
+        segment.origin = segment.origin._replace(seed=seed)
     monkeypatch.setattr(update.teacher, "plays", lambda episode: episode > 0)
     metrics = update.step(segments)
     assert (metrics["policy_success"], metrics["teacher_success"]) == (0.5, 0.0), "it is not ready"
-    with torch.no_grad():
-        update.teacher.ready.fill_(1)
+    update.teacher.ready.fill_(1)
     metrics = update.step(segments)
-    assert metrics["policy_success"] == pytest.approx(3 / 5)
-    assert metrics["teacher_success"] == pytest.approx(1 / 3)
+    found = metrics["policy_success"], metrics["teacher_success"]
+    assert found == pytest.approx((3 / 5, 1 / 3))
 
 
 def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
-    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
+    update = learner(tiny_checkpoint, policy_steps=1.0)
     before = update.adapter.export_trainable()
     assert "imitation_loss" not in update.step([episode([0.0, 0.0])])
-    after = update.adapter.export_trainable()
-    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert_equal(update.adapter.export_trainable(), before)
     assert "imitation_loss" in update.step([episode([0.0, 1.0])])
 
 
@@ -392,7 +320,6 @@ def test_imitation_is_flow_matching():
     shape = FlowShape(num_steps=3, chunk_size=4, executed=3, padded_dim=5, action_dim=2)
     target = torch.zeros(64, 4, 5)
     target[:, :3, :2] = torch.randn(64, 3, 2)
-
     family = FlowFamily(SimpleNamespace(shape=shape), FlowSamplerConfig())
     for off in (0.0, 1.0):
         velocity = lambda x, t, off=off: (x - target) / t[:, None, None] + off  # noqa: E731
@@ -401,57 +328,45 @@ def test_imitation_is_flow_matching():
         torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
 
 
-def tried(rng: np.random.Generator, reward: Callable[[float], float]) -> list[Segment]:
-    """32 episodes of one random chunk; the reward is of its first action."""
-    actions = rng.uniform(-1, 1, (32, 1, 4, 2)).astype(np.float32)
-    return [episode([reward(float(each[0, 0, 0]))], actions=each) for each in actions]
-
-
 def first_action(update: OffPolicyUpdate) -> float:
     """Mean over noise of the first number that the policy does without exploring."""
-    state = np.zeros(4, np.float32)
-    observation: Any = {"observation.state": state, TASK: "Match the target", ENVIRONMENT_STATE: state[:1]}
-    observation |= {"observation.images.front": np.zeros((32, 32, 3), np.uint8)}
-    asked = [Request(observation=observation, noise_seed=i, explore=False) for i in range(64)]
+    seen: Any = {name: array[0] for name, array in episode([0.0]).observations.items()}
+    seen["task"] = "Match the target"
+    asked = [Request(observation=seen, noise_seed=i, explore=False) for i in range(64)]
     return float(np.mean([decision.chunk[0, 0] for decision in update.adapter.decide(asked, 0)]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("precision", "updates"), [("fp32", 6), ("bf16", 4)])
+@pytest.mark.parametrize(("precision", "updates", "least"), [("fp32", 6, 0.2), ("bf16", 4, 0.0)])
 def test_teacher_and_policy_go_where_the_critic_leads(
-    precision: str, updates: int, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+    precision: str, updates: int, least: float, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Reward is how far the first action goes up; the state says nothing. bf16 is emulated, and slow."""
     torch.manual_seed(0)
     monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
-    monkeypatch.setattr(off_policy, "POLICY_BATCH", 16)
+    monkeypatch.setattr("accerl_lerobot.algorithms.off_policy.POLICY_BATCH", 16)
     algorithm = ChunkCriticConfig(critic_steps=4.0, policy_steps=0.5)
-    update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
+    rates = {"lr": 1e-3, "value_lr": 1e-3, "value_warmup_updates": 2}
+    update = learning(tiny_checkpoint, algorithm, SimulatorStateConfig(), **rates)
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: precision == "bf16")
     automatic = PolicyConfig(path=str(tiny_checkpoint), device="cpu", precision="auto")
     update.adapter.precision, cast = load_adapter(automatic).precision, set()
     update.critic.register_forward_hook(lambda *_: cast.add(torch.is_autocast_enabled("cpu")))
-    rng, metrics = np.random.default_rng(0), {}
-    before = first_action(update)
+    rng, before = np.random.default_rng(0), first_action(update)
     for _ in range(updates):
-        metrics = update.step(tried(rng, lambda up: (1 + up) / 2))
+        actions = rng.uniform(-1, 1, (32, 1, 4, 2)).astype(np.float32)
+        metrics = update.step([episode([(1 + float(a[0, 0, 0])) / 2], actions=a) for a in actions])
         assert bool(update.teacher.ready) == (update.version > 2)
     assert cast == {precision == "bf16"} and np.isfinite(list(metrics.values())).all()
-    assert first_action(update) > before
-    if precision == "bf16":
-        return
-    state = update.tensor("state", np.arange(1))
-    assert update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0] > 0.3
-    assert first_action(update) > before + 0.2
-    assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == updates * 32
+    assert first_action(update) > before + least
+    assert metrics["memory_decisions"] == updates * 32
+    assert precision == "bf16" or metrics["explained_variance"] > 0.5
 
 
 def test_blocks_that_forget_compute_again_and_learn_the_same(tiny_checkpoint: Path):
-    counts, weights = [], []
+    counts, weights, algorithm = [], [], SelfImitationConfig(policy_steps=1.0)
     for forget in (False, True):
-        update = learning(
-            tiny_checkpoint, SelfImitationConfig(policy_steps=1.0), activation_checkpointing=forget
-        )
+        update = learning(tiny_checkpoint, algorithm, activation_checkpointing=forget)
         calls: list[None] = []
         for module in update.adapter.policy.modules():
             module.register_forward_hook(lambda *_, calls=calls: calls.append(None))
@@ -505,25 +420,9 @@ def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: 
     assert changed == {"value_head"} and metrics["value_loss"] < 0.05
 
 
-def test_it_goes_where_returns_are_high(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
-    """The return is how far the first action goes up; nothing counts as a success."""
-    monkeypatch.setattr(off_policy, "POLICY_BATCH", 32)
-    update = learning(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), lr=1e-3, value_lr=1e-2)
-    rng, before = np.random.default_rng(0), first_action(update)
-    for _ in range(6):
-        segments = tried(rng, lambda up: (1 + up) / 2)
-        for segment in segments:
-            segment.success = False
-        update.step(segments)
-    assert first_action(update) > before + 0.2
-
-
-@pytest.mark.parametrize("make", [learner, latent_learner, partial(learning, algorithm=AWRConfig())])
-def test_what_was_learnt_is_restored_to_the_last_bit(
-    make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(LatentModel, "first_steps", 3)
-    monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 8)
+@pytest.mark.parametrize("make", [learner, partial(learning, algorithm=AWRConfig())])
+def test_what_was_learnt_is_restored_to_the_last_bit(make: Callable[[Path], Any], tiny_checkpoint: Path):
+    """On a latent state: see `test_resume_exact`."""
 
     def steps(update: OffPolicyUpdate, seed: int) -> dict[str, float]:
         torch.manual_seed(seed)
@@ -535,19 +434,15 @@ def test_what_was_learnt_is_restored_to_the_last_bit(
     other.adapter.load_trainable(one.adapter.export_trainable())
     other.restore(one.state())
     assert steps(one, 1) == steps(other, 1)
-    left, right = one.adapter.export_trainable(), other.adapter.export_trainable()
-    assert all(np.array_equal(left[name], right[name]) for name in left)
+    assert_equal(other.adapter.export_trainable(), one.adapter.export_trainable())
 
 
 def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
-    """The loss of a step equals the family's, averaged over those rows of its batch that succeeded."""
     update = learning(tiny_checkpoint, SelfImitationConfig(policy_steps=0.25), lr=0.0)
     adapter = update.adapter
     adapter.family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
-    segments = []
-    for value, reward in ((1.0, 1.0), (3.0, 1.0), (100.0, 0.0), (200.0, 0.0)):
-        actions = np.full((1, 4, 2), value, np.float32)
-        segments.append(episode([reward], actions=actions))
+    values = ((1.0, 1.0), (3.0, 1.0), (100.0, 0.0), (200.0, 0.0))
+    segments = [episode([won], actions=np.full((1, 4, 2), value, np.float32)) for value, won in values]
     loss = update.step(segments)["imitation_loss"]
     low, high = (adapter.processing.normalise(torch.full((1, 4, 2), v))[0, 0, 0] for v in (1.0, 3.0))
     assert low < loss < high
@@ -569,14 +464,13 @@ def test_less_memory_gives_the_same_step(tiny_checkpoint: Path):
 
 
 def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
-    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
+    update = learner(tiny_checkpoint, policy_steps=1.0)
     before = update.adapter.export_trainable()
+    torch.nn.init.constant_(update.teacher.network.biases[0], math.nan)
     with pytest.raises(NonFiniteError, match="5 steps in a row"):
-        with torch.no_grad():
-            update.teacher.network.biases[0].fill_(float("nan"))
         update.step([episode([0.0, 0.0, 0.0, 1.0])])
-    after = update.adapter.export_trainable()
-    assert all(np.array_equal(before[name], after[name]) for name in before if name.startswith("policy."))
+    policy = {name: tensor for name, tensor in before.items() if name.startswith("policy.")}
+    assert_equal(update.adapter.export_trainable(), policy)
 
 
 @pytest.mark.parametrize(
@@ -584,19 +478,16 @@ def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
     [
         (
             {"env": SimulatedConfig(), "world_model": SimulatorStateConfig()},
-            r"world_model\.type='simulator': .*add env\.environment_state",
+            "world_model.type='simulator': .*add env.environment_state",
         ),
         (
             {"algorithm": SelfImitationConfig(), "world_model": LatentConfig()},
-            r"world_model\.type='latent': .*use chunk_critic",
+            "='latent': .*use chunk_critic",
         ),
-        (
-            {"env": SimulatedConfig(max_steps=4)},
-            r"world_model\.type='latent': an episode is one decision.*lower policy\.n_action_steps",
-        ),
-        ({"replay": ReplayConfig(samples_per_insert=2.0)}, r"replay\.samples_per_insert=2\.0: .*use 1\.0"),
-        ({"trainer": TrainerConfig(ranks=2)}, r"trainer\.ranks=2: .*use 1"),
-        ({"rollout": RolloutConfig(segment_length=3)}, r"rollout\.segment_length=3: .*use at least 4"),
+        ({"env": SimulatedConfig(max_steps=4)}, "='latent': an episode is one .*lower policy.n_action_steps"),
+        ({"replay": ReplayConfig(samples_per_insert=2.0)}, "replay.samples_per_insert=2.0: .*use 1.0"),
+        ({"trainer": TrainerConfig(ranks=2)}, "trainer.ranks=2: .*use 1"),
+        ({"rollout": RolloutConfig(segment_length=3)}, "rollout.segment_length=3: .*use at least 4"),
     ],
 )
 def test_what_it_cannot_learn_from_is_refused(tiny_checkpoint: Path, sections: dict[str, Any], message: str):

@@ -18,8 +18,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.tensors import whole
-from accerl_lerobot.experience import Segment
-from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.testing import perturb
 from tests.algorithms.sharded import join, leave
@@ -35,8 +33,6 @@ SHARDED = {"ranks": 2, "sharding": "zero3"}
 
 
 class Case(NamedTuple):
-    """A policy, and what of it is shared out."""
-
     kind: str
     config: dict[str, Any] = SHARDED
     options: dict[str, Any] = {}
@@ -51,7 +47,7 @@ CASES = {kind: Case(kind) for kind in POLICIES} | {
 
 
 def learn(case: Case, folder: Path, config: TrainerConfig) -> dict[str, Any]:
-    """Makes two updates on what `segments` has left there; all that is published and saved afterwards."""
+    """Makes two updates on the segments there; all that is published and saved afterwards."""
     batch = snapshot.load(folder / case.kind / "segments")
     with POLICIES[case.kind].context():
         torch.manual_seed(0)
@@ -74,13 +70,6 @@ def learn(case: Case, folder: Path, config: TrainerConfig) -> dict[str, Any]:
         }
 
 
-def segments(adapter: LeRobotAdapter, kind: str) -> list[Segment]:
-    asked = POLICIES[kind].requests(DECISIONS + 1)
-    made = as_segment(asked, adapter, DECISIONS)
-    made.reward = np.linspace(-1, 1, DECISIONS, dtype=np.float32)
-    return [made]
-
-
 def work(rank: int, size: int, place: Any, folder: Path) -> None:
     torch.set_num_threads(1)
     logging.disable()
@@ -98,7 +87,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with kind.context():
             (directory / name).mkdir()
             adapter = adapter_at(kind.write(directory / name / "pretrained_model"))
-            snapshot.save(directory / name / "segments", segments(adapter, name))
+            made = as_segment(kind.requests(DECISIONS + 1), adapter, DECISIONS)
+            made.reward = np.linspace(-1, 1, DECISIONS, dtype=np.float32)
+            snapshot.save(directory / name / "segments", [made])
     place = torch.multiprocessing.get_context("spawn").SimpleQueue()
     torch.multiprocessing.spawn(work, (2, place, directory), nprocs=2)
     return directory

@@ -62,7 +62,7 @@ def test_sample_waits_for_the_warm_start_and_then_for_new_segments():
         await worker.insert([make_segment("b", 4)])
         assert sorted(s.key for s in await early) == ["a", "b"]
         again = start(worker.sample(BATCH, 1))
-        assert await waits(again), "segments that were drawn as often as the pace allows are not drawn again"
+        assert await waits(again), "both were drawn as often as the pace allows"
         await worker.insert([make_segment("c", 8)])
         assert [s.key for s in await again] == ["c"]
 

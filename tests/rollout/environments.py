@@ -22,13 +22,9 @@ CAMERA = "observation.images.front"
 class ScriptedEnvironment(Environment):
     """Every step earns 1; an episode ends after `steps` steps in the way `end` says.
 
-    ``observation.state`` is (seed, steps so far), which names every observation.
-
-    Args:
-        steps: length of an episode in env steps.
-        end: ``success`` (terminates), ``failure`` (terminates) or ``limit`` (truncates).
-        nan_at: step of an episode that is no number; 0 for never.
-        nan_in: what of it: its ``reward``, the ``state`` after it, or of the ``simulator``.
+    ``observation.state`` is (seed, steps so far), which names every observation. The way is ``success``,
+    ``failure`` (both terminate) or ``limit`` (truncates). At step `nan_at`, if it is not 0, the ``reward``,
+    the ``state`` or that of the ``simulator`` is no number.
     """
 
     def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0, nan_in: str = "reward") -> None:
@@ -38,33 +34,27 @@ class ScriptedEnvironment(Environment):
             images={CAMERA: (8, 8, 3)}, state_dim=2, action_dim=1, action_low=-one, action_high=one,
             fps=10, max_steps=steps, tasks=("push", "pull"),
         )  # fmt: skip
-        self.seed = self.now = 0
-        self.task = ""
 
     def reset(self, seed: int, task: str) -> Observation:
         self.seed, self.task, self.now = seed, task, 0
         return self._observe()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        rewards, broken = [], False
-        for _ in actions:
-            self.now += 1
-            broken = broken or self.now == self.nan_at
-            rewards.append(np.nan if broken and self.nan_in == "reward" else 1.0)
-            if self.now == self.steps:
-                break
-        over = self.now == self.steps
-        terminated = over and self.end != "limit"
-        observation = self._observe()
-        if broken and self.nan_in == "state":
+        rewards = np.ones(min(len(actions), self.steps - self.now), np.float32)
+        broken = self.nan_in if self.now < self.nan_at <= self.now + len(rewards) else ""
+        self.now += len(rewards)
+        over, observation = self.now == self.steps, self._observe()
+        if broken == "reward":
+            rewards[-1] = np.nan
+        if broken == "state":
             observation["observation.state"] = np.full(2, np.nan, np.float32)
         return ChunkResult(
             observation=observation,
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
+            rewards=rewards,
+            terminated=over and self.end != "limit",
             truncated=over and self.end == "limit",
             success=over and self.end == "success",
-            finite=not (broken and self.nan_in == "simulator"),
+            finite=broken != "simulator",
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
@@ -76,7 +66,7 @@ class ScriptedEnvironment(Environment):
 
 
 def decide(request: Request, version: int = 0) -> Decision:
-    """A decision whose latent and log-prob are the step it was made at: they can be told apart."""
+    """A decision whose latent and log-prob are the step it was made at."""
     step = float(np.asarray(request.observation["observation.state"])[1])
     return Decision(
         chunk=np.zeros((CHUNK, 1), np.float32),
@@ -92,20 +82,20 @@ class Recorder:
     def __init__(
         self, environments: list[Environment], plans: list[EpisodePlan], config: RolloutConfig
     ) -> None:
-        self.plans = EpisodePlans(("push", "pull"), 0, None)
+        self.plans = EpisodePlans(("push", "pull", "match"), 0, None)
         self.plans.queue(plans)
         self.runner = RolloutRunner(environments, self.plans, config)
         self.segments, self.results = self.runner.segments, self.runner.results
 
-    def play(self, version: int = 0) -> list[list[Request]]:
-        """Runs all plans, slot by slot in turn; the requests each slot made."""
-        made: list[list[Request]] = [[] for _ in range(len(self.runner))]
+    def play(self) -> list[Request]:
+        """Runs all plans, slot by slot in turn; all requests that were made."""
+        made: list[Request] = []
         due = {slot: self.runner.start(slot) for slot in range(len(self.runner))}
         while any(due.values()):
             for slot, request in due.items():
                 if request is not None:
-                    made[slot].append(request)
-                    due[slot] = self.runner.advance(slot, decide(request, version))
+                    made.append(request)
+                    due[slot] = self.runner.advance(slot, decide(request))
         return made
 
 

@@ -10,18 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
-from accerl_lerobot.experience import REAL, Decision, Request
-from accerl_lerobot.rollout.runner import (
-    EpisodePlan,
-    EpisodePlans,
-    EpisodeResult,
-    RolloutConfig,
-    budgets,
-    incarnation_after,
-)
+from accerl_lerobot.experience import REAL
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, RolloutConfig, incarnation_after
 from accerl_lerobot.seeds import train_seed
 from tests.rollout.environments import CHUNK, Recorder, ScriptedEnvironment, decide, evaluate, explore
 
@@ -40,29 +32,31 @@ def steps_seen(segment) -> list[float]:
 
 
 def test_an_episode_is_cut_into_segments_without_a_gap():
-    recorder = played(steps=14, end="limit")
-    assert [len(s) for s in recorder.segments] == [3, 3, 1]
-    assert [s.origin.decision for s in recorder.segments] == [0, 3, 6]
-    assert [steps_seen(s) for s in recorder.segments] == [[0, 2, 4, 6], [6, 8, 10, 12], [12, 14]]
+    segments = played(steps=14, end="limit").segments
+    assert [(len(s), s.origin.decision) for s in segments] == [(3, 0), (3, 3), (1, 6)]
+    assert [steps_seen(s) for s in segments] == [[0, 2, 4, 6], [6, 8, 10, 12], [12, 14]]
     # A decision's latent names the step it was made at: it must stand beside that observation.
-    for segment in recorder.segments:
-        assert segment.latent["x"][:, 0].tolist() == steps_seen(segment)[:-1]
+    assert all(s.latent["x"][:, 0].tolist() == steps_seen(s)[:-1] for s in segments)
+
+
+def test_a_result_has_the_totals_of_its_episode_and_the_oldest_and_newest_weights():
+    recorder = Recorder([ScriptedEnvironment(steps=2 * CHUNK + 1)], [explore()], CONFIG)
+    request = recorder.runner.start(0)
+    for version in (4, 3, 5):
+        request = recorder.runner.advance(0, decide(request, version))
+    (result,), (segment,), counters = recorder.results, recorder.segments, recorder.runner.counters
+    assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 5.0, 5, 3)
+    assert result.versions == (3, 5) and segment.version.tolist() == [4, 3, 5]
+    assert segment.steps.tolist() == segment.reward.tolist() == [2, 2, 1], "it ended within a chunk"
+    assert (counters.env_steps, counters.decisions, counters.episodes) == (5, 3, 1)
 
 
 @pytest.mark.parametrize(("end", "success"), [("success", True), ("failure", False), ("limit", False)])
 def test_the_last_segment_says_how_the_episode_ended(end, success):
     recorder = played(steps=8, end=end)
-    cut, last = recorder.segments
-    assert (cut.terminated, cut.success) == (False, False)
-    assert (last.terminated, last.success) == (True, success)
-    assert steps_seen(last) == [6, 8]
+    ends = [(segment.terminated, segment.success) for segment in recorder.segments]
+    assert ends == [(False, False), (True, success)]
     assert recorder.results[0].decisions == 4 and recorder.results[0].success is success
-
-
-def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
-    recorder = played(steps=2 * CHUNK + 1)
-    assert recorder.segments[0].steps.tolist() == recorder.segments[0].reward.tolist() == [2, 2, 1]
-    assert recorder.runner.counters.env_steps == 5 and recorder.runner.counters.decisions == 3
 
 
 def test_every_decision_costs():
@@ -76,9 +70,7 @@ def test_every_decision_costs():
 
 def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episode():
     begun = Recorder([ScriptedEnvironment(steps=9)], [explore()], CONFIG).runner
-    request = begun.start(0)
-    assert request is not None
-    begun.advance(0, decide(request))
+    begun.advance(0, decide(begun.start(0)))
     state = begun.state()
     environment = ScriptedEnvironment(steps=9)
     resumed = Recorder([environment], [], CONFIG).runner
@@ -89,33 +81,19 @@ def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episo
         resumed.restore(state)
 
 
-def test_a_result_has_the_totals_of_its_episode_and_the_oldest_and_newest_weights():
-    recorder = Recorder([ScriptedEnvironment(steps=5)], [explore()], CONFIG)
-    request = recorder.runner.start(0)
-    for version in (4, 3, 5):
-        assert request is not None
-        request = recorder.runner.advance(0, decide(request, version))
-    (result,) = recorder.results
-    assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 5.0, 5, 3)
-    assert result.versions == (3, 5) and recorder.runner.counters.episodes == 1
-    assert recorder.segments[0].version.tolist() == [4, 3, 5]
-
-
 @pytest.mark.parametrize("nan_in", ["reward", "state", "simulator"])
 def test_a_nan_is_counted_and_the_next_episode_goes_on(nan_in: str):
-    environments = [ScriptedEnvironment(steps=20, nan_at=9, nan_in=nan_in)]
-    recorder = Recorder(environments, [explore(1)], CONFIG)
+    environment = ScriptedEnvironment(steps=20, nan_at=9, nan_in=nan_in)
+    recorder = Recorder([environment], [explore(1)], CONFIG)
     recorder.play()
     # Decisions 1 to 3 had become a segment; the 4th and 5th had not when the 5th met the NaN.
-    assert [len(s) for s in recorder.segments] == [3]
-    assert recorder.runner.counters.dropped_nonfinite == 2
-    assert not recorder.results and recorder.runner.counters.episodes == 0
-    environments[0].nan_at = 0
+    assert recorder.runner.counters.dropped_nonfinite == 2 and not recorder.results
+    environment.nan_at = 0
     recorder.plans.queue([explore(2)])
     recorder.play()
-    assert len(recorder.results) == 1 and recorder.results[0].plan.seed == 2
-    seeds = {s.observations["observation.state"][0, 0] for s in list(recorder.segments)[1:]}
-    assert seeds == {2.0}, "nothing of the dropped episode may follow"
+    assert [result.plan.seed for result in recorder.results] == [2]
+    seeds = [s.observations["observation.state"][0, 0] for s in recorder.segments]
+    assert seeds == [1, 2, 2, 2, 2], "nothing of the dropped episode may follow"
 
 
 def test_an_evaluation_that_meets_a_nan_still_has_a_result():
@@ -128,22 +106,19 @@ def test_an_evaluation_that_meets_a_nan_still_has_a_result():
 
 
 class Unlucky(ScriptedEnvironment):
-    """An environment whose first observation is not finite where the seed is odd."""
+    """Its first observation is not finite where the seed is odd."""
 
     def reset(self, seed, task):
-        observation = super().reset(seed, task)
-        if seed % 2:
-            observation["observation.state"] = np.array([np.inf, 0], np.float32)
-        return observation
+        return super().reset(seed, task) | {"observation.state": np.array([np.inf if seed % 2 else seed, 0])}
 
 
 def test_nothing_but_dropped_episodes_ends_the_rollout_with_one_line():
-    again_and_again = [explore(seed) for seed in (*range(1, 37, 2), 2, *range(1, 37, 2), 4)]
+    again_and_again = [explore(seed) for seed in (*[1] * 18, 2, *[1] * 18, 4)]
     recorder = Recorder([Unlucky()], again_and_again, CONFIG)
     recorder.play()
     assert [r.plan.seed for r in recorder.results] == [2, 4]
     assert recorder.runner.counters.dropped_episodes == 36
-    recorder = Recorder([Unlucky()], [explore(seed) for seed in range(1, 99, 2)], CONFIG)
+    recorder = Recorder([Unlucky()], [explore(1)] * 50, CONFIG)
     message = r"env='push': 20 episodes in a row .* observation\.state of the first observation is not finite"
     with pytest.raises(InputError, match=message):
         recorder.play()
@@ -151,49 +126,26 @@ def test_nothing_but_dropped_episodes_ends_the_rollout_with_one_line():
 
 def test_evaluation_asks_for_the_stock_sampler_and_makes_no_segment():
     recorder = Recorder([ScriptedEnvironment()], [evaluate(1), explore(2)], CONFIG)
-    requests = recorder.play()[0]
-    assert [r.explore for r in requests] == [False] * 3 + [True] * 3
+    assert [r.explore for r in recorder.play()] == [False] * 3 + [True] * 3
     assert len(recorder.segments) == 1 and len(recorder.results) == 2
 
 
-def seeds_by_episode(slots: int, plans: list[EpisodePlan]) -> dict[int, list[int]]:
-    recorder = Recorder([ScriptedEnvironment(steps=6) for _ in range(slots)], plans, CONFIG)
-    found: dict[int, list[int]] = {}
-    for requests in recorder.play():
-        for request in requests:
-            episode = int(np.asarray(request.observation["observation.state"])[0])
-            found.setdefault(episode, []).append(request.noise_seed)
-    return found
-
-
 def test_noise_depends_on_episode_and_decision_and_on_nothing_else():
-    plans = [explore(seed) for seed in (1_000_000_000, 1_000_000_001, 2_000_000_007, 5)]
-    alone, together = seeds_by_episode(1, plans), seeds_by_episode(3, plans[::-1])
-    assert alone == together
-    every = [seed for seeds in alone.values() for seed in seeds]
-    assert len(every) == 4 * 3 and len(set(every)) == len(every)
+    plans = [explore(seed) for seed in (5, 6, 1_000_000_000, 2_000_000_000)]
+    noise: list[dict[bytes, int]] = []
+    for slots, order in ((1, plans), (3, plans[::-1])):
+        asked = Recorder([ScriptedEnvironment(steps=6) for _ in range(slots)], order, CONFIG).play()
+        noise.append({r.observation["observation.state"].tobytes(): r.noise_seed for r in asked})
+    assert noise[0] == noise[1]
+    assert len(set(noise[0].values())) == 4 * 3
 
 
-def simulated_episode(film: bool, tolerance: float) -> EpisodeResult:
-    """One evaluation episode with actions drawn from the requests' own seeds."""
-    environment = make_environment(SimulatedConfig(max_steps=20, tolerance=tolerance))
-    plan = EpisodePlan(task="match", seed=1, explore=False, film=(8, 2) if film else None)
-    recorder = Recorder([environment], [plan], CONFIG)
-    request: Request | None = recorder.runner.start(0)
-    while request is not None:
-        target = np.asarray(request.observation["observation.state"])[:2]
-        chunk = target + np.random.default_rng(request.noise_seed).normal(0, 1.0, (7, 2))
-        zero = np.zeros(1, np.float32)
-        decision = Decision(chunk=chunk.astype(np.float32), latent={}, log_prob=zero, version=1)
-        request = recorder.runner.advance(0, decision)
-    return recorder.results[0]
-
-
-@pytest.mark.parametrize(("tolerance", "success"), [(0.3, True), (0.001, False)])
-def test_filming_changes_nothing(tolerance: float, success: bool):
-    plain, filmed = (simulated_episode(film, tolerance) for film in (False, True))
-    assert plain.success is success and plain.frames == []
-    assert len(filmed.frames) >= filmed.steps // 2 and all(f.shape == (8, 8, 3) for f in filmed.frames)
+@pytest.mark.parametrize("end", ["success", "limit"])
+def test_filming_changes_nothing(end: str):
+    plans = [replace(evaluate(), film=film) for film in (None, (8, 2))]
+    plain, filmed = played(*plans, steps=9, end=end).results
+    assert plain.frames == []
+    assert len(filmed.frames) >= 9 // 2 and all(frame.shape == (8, 8, 3) for frame in filmed.frames)
     assert replace(filmed, plan=plain.plan, frames=[]) == plain
 
 
@@ -211,10 +163,9 @@ def take(plans: EpisodePlans, count: int) -> list[EpisodePlan]:
 
 
 def test_every_episode_has_its_own_seed_and_tasks_take_turns():
-    plans = take(make(worker=1), 5)
-    assert [p.task for p in plans] == ["pull", "lift", "push", "pull", "lift"]
-    assert [p.seed for p in plans] == [train_seed(3, 1, number) for number in range(5)]
-    assert all(p.explore for p in plans)
+    plans = [(plan.task, plan.seed, plan.explore) for plan in take(make(worker=1), 5)]
+    tasks = ["pull", "lift", "push", "pull", "lift"]
+    assert plans == [(task, train_seed(3, 1, number), True) for number, task in enumerate(tasks)]
 
 
 def test_a_task_that_fails_more_is_explored_more_and_goes_on_so_after_a_restart():
@@ -261,10 +212,3 @@ def test_no_more_episodes_than_were_paid_for():
     assert take(plans, 2) == [evaluate(index=0)], "evaluations are not counted"
     endless = make()
     assert len(take(endless, 9)) == 9 and not endless.spent
-
-
-@pytest.mark.parametrize(
-    ("episodes", "workers", "shares"), [(7, 3, [3, 2, 2]), (1, 2, [1, 0]), (0, 2, [None, None])]
-)
-def test_a_budget_is_shared_among_workers(episodes: int, workers: int, shares: list[int | None]):
-    assert budgets(RolloutConfig(episodes=episodes, workers=workers)) == shares

@@ -9,71 +9,44 @@ from typing import Any
 import pytest
 import ray
 
+from accerl_lerobot.algorithms import ranks as rank_module
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.trainer.worker import Peers
 
-THREE = TrainerConfig(ranks=3)
-WAIT_S = 2.0
-
 
 class LightRank:
-    """Answers `step` in the way it is asked to."""
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-    def step(self, how: str) -> int:
+    def step(self, how: str) -> None:
         if how == "dies":
             os._exit(1)
         if how == "hangs":
             time.sleep(60)
         if how == "fails":
             raise ArithmeticError("the gradient fell over")
-        self.steps += 1
-        return self.steps
-
-    def made(self) -> int:
-        return self.steps
-
-
-def ranks(count: int) -> list[Any]:
-    actors = [ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(count)]
-    assert ray.get([actor.made.remote() for actor in actors]) == [0] * count
-    return actors
-
-
-def test_they_have_done_it_when_the_first_goes_on(light_ray: None):
-    actors = ranks(2)
-    for _ in range(3):
-        with Peers(actors, THREE, WAIT_S).joining("step", "fine"):
-            pass
-    assert [ray.get(actor.made.remote()) for actor in actors] == [3, 3]
 
 
 @pytest.mark.parametrize(
     ("how", "error"), [("fails", "the gradient fell over"), ("dies", "died"), ("hangs", "Get timed out")]
 )
 def test_a_rank_that_is_lost_ends_the_wait(light_ray: None, how: str, error: str):
-    actors = ranks(1)
-    with (
-        pytest.raises(ray.exceptions.RayError, match=error),
-        Peers(actors, THREE, WAIT_S).joining("step", how),
-    ):
+    actor: Any = ray.remote(LightRank).options(num_cpus=0).remote()
+    assert ray.get(actor.__ray_ready__.remote())
+    peers = Peers([actor], TrainerConfig(ranks=2), 2.0)
+    with peers.joining("step", "fine"):
         pass
-    ray.kill(actors[0])
+    with pytest.raises(ray.exceptions.RayError, match=error), peers.joining("step", how):
+        pass
+    ray.kill(actor)
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
-    from accerl_lerobot.algorithms import ranks
-
-    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+    names = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")
+    for name in names:
         monkeypatch.setenv(name, "")
     at = SimpleNamespace
     faces = {"lo": [at(address="127.0.0.1")], "a": [at(address="fe80::1"), at(address="10.0.0.2")], "b": []}
-    monkeypatch.setattr(ranks.psutil, "net_if_addrs", lambda: faces)
-    ranks.use_only("127.0.0.1")
-    assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("lo", "")
-    ranks.use_only("10.0.0.2")
-    assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("a", "a")
+    monkeypatch.setattr(rank_module.psutil, "net_if_addrs", lambda: faces)
+    for address, expected in (("127.0.0.1", ["lo", ""]), ("10.0.0.2", ["a", "a"])):
+        rank_module.use_only(address)
+        assert [os.environ[name] for name in names] == expected
     with pytest.raises(RuntimeError, match=r"no interface of this machine has the address 10\.0\.0\.3"):
-        ranks.use_only("10.0.0.3")
+        rank_module.use_only("10.0.0.3")

@@ -1,45 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages over sockets: the promises at the top of `transport`; which weights replicas get."""
 
+import copy
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from accerl_lerobot import transport
-from accerl_lerobot.experience import Decision, Request, Tensors
+from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.trainer import worker
 from accerl_lerobot.trainer.worker import WeightPublisher
-from accerl_lerobot.transport import (
-    Address,
-    Client,
-    PendingRequest,
-    ReconnectingClient,
-    Server,
-    ServiceStoppedError,
-)
+from accerl_lerobot.transport import Client, PendingRequest, ReconnectingClient, Server, ServiceStoppedError
 from tests.replay.segments import make_segment
 from tests.runs import eventually
-from tests.transport.played import PlayedClient
 
 LONG_S = 120.0
-HOSTS = [pytest.param(None, id="unix"), pytest.param("127.0.0.1", id="tcp")]
 
 
 class Service:
     """A service on a thread, which echoes, holds or fails as a message says."""
 
-    def __init__(self, host: str | None = None) -> None:
+    def __init__(self, host: str | None) -> None:
         self.held: list[PendingRequest] = []
         self.server = Server(self._take, host)
         self.over = False
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
+
+    def client(self) -> Client:
+        return Client("service", self.server.address)
 
     def _serve(self) -> None:
         while not self.over:
@@ -65,7 +60,7 @@ class Service:
             self.server.close()
 
 
-@pytest.fixture(params=HOSTS)
+@pytest.fixture(params=[None, "127.0.0.1"], ids=["unix", "tcp"])
 def service(request: pytest.FixtureRequest) -> Iterator[Service]:
     made = Service(request.param)
     yield made
@@ -86,23 +81,20 @@ def awaited(client: Client, tickets: list[int]) -> list[Any]:
     return [replies[ticket] for ticket in tickets]
 
 
-def same(a: Any, b: Any) -> bool:
-    """True if two messages are equal, types, dtypes and shapes included."""
-    if type(a) is not type(b):
-        return False
-    if isinstance(a, np.ndarray | np.generic):
-        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-    if isinstance(a, dict):
-        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return same(vars(a), vars(b)) if hasattr(a, "__dict__") else bool(a == b or a != a)
+def parts(message: Any) -> Any:
+    """What a message is made of, with types, dtypes and shapes."""
+    if isinstance(message, np.ndarray | np.generic):
+        return message.dtype, message.shape, message.tobytes()
+    if isinstance(message, dict):
+        return [(key, parts(value)) for key, value in message.items()]
+    if isinstance(message, list | tuple):
+        return type(message), [parts(value) for value in message]
+    return type(message), parts(vars(message)) if hasattr(message, "__dict__") else repr(message)
 
 
-def messages() -> list[Any]:
-    draw = np.random.default_rng(0)
-    image = draw.integers(0, 255, (96, 64, 3)).astype(np.uint8)
-    chunk = draw.normal(size=(4, 2)).astype(np.float32)
+def test_what_is_sent_arrives_whole_and_can_be_written_to(service: Service):
+    client, image = service.client(), np.arange(96 * 64 * 3, dtype=np.uint8).reshape(96, 64, 3)
+    chunk = np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32)
     arrays = {
         "strided": image[::2, :, 1],
         "turned": np.arange(12_000, dtype=np.float64).reshape(30, 400).T,
@@ -111,31 +103,25 @@ def messages() -> list[Any]:
         "other way round": np.arange(3000, dtype=">i4"),
     }
     observation = {"observation.images.front": image, "observation.state": chunk, "task": "öffne 🚪"}
-    return [
+    for message in (
         arrays,
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
         [Decision(chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], version=2**40)],
         [make_segment("a", 3), make_segment("b", 2)],
         [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
-    ]
-
-
-def test_what_is_sent_arrives_whole_and_can_be_written_to(service: Service):
-    client = Client("service", service.server.address)
-    for message in messages():
+    ):
         (reply,) = ask(client, ("echo", message))
-        assert same(reply, message), message
+        assert parts(reply) == parts(message)
     (reply,) = ask(client, ("echo", np.zeros(100_000)))
     reply += 1
     client.close()
 
 
 def test_replies_go_to_the_messages_they_answer_and_to_their_client(service: Service):
-    clients = [Client("service", service.server.address) for _ in range(3)]
+    clients = [service.client() for _ in range(3)]
     late = clients[0].send(("hold", "late"))
     assert ask(clients[0], *(("echo", i) for i in range(8))) == list(range(8))
     assert ask(clients[1], ("echo", "other")) == ["other"]
-    clients[1].close()
     clients[1].close()
     assert ask(clients[2], ("release", None), ("echo", 1)) == [None, 1]
     assert clients[0].done(LONG_S) == [(late, "late")] and clients[0].done(0.0) == []
@@ -143,7 +129,7 @@ def test_replies_go_to_the_messages_they_answer_and_to_their_client(service: Ser
 
 def test_many_large_messages_are_under_way_and_their_arrays_may_change(service: Service):
     """Neither end waits for the other to read first."""
-    client = Client("service", service.server.address)
+    client = service.client()
     sizes = [10, 300_000, 70, 5_000_000, 0, *[400_000] * 12]
     array = np.empty(max(sizes), np.uint8)
     tickets = []
@@ -170,31 +156,29 @@ def test_no_end_waits_for_one_that_reads_nothing(monkeypatch: pytest.MonkeyPatch
         server.poll(0.01)
         client.done(0.0)
     requests[0].answer(large)
-    replies: list[Any] = []
-    while not replies:
+    while not (replies := client.done(0.0)):
         server.poll(0.01)
-        replies = client.done(0.0)
     np.testing.assert_array_equal(replies[0][1], large)
     server.close()
 
 
 def test_a_client_learns_that_the_service_has_failed_or_is_gone(service: Service):
-    client = Client("service", service.server.address)
+    client = service.client()
     client.send(("fail", "it fell over"))
     with pytest.raises(ServiceStoppedError, match=r"service: .*it fell over"):
         client.done(LONG_S)
     client.send(("hold", 1))
-    new = Client("service", service.server.address)  # which may not have been served yet
+    new = service.client()  # which may not have been served yet
     service.close()
     for late in (client, new):
         with pytest.raises(ServiceStoppedError, match="service is gone"):
             late.done(LONG_S)
     with pytest.raises(ServiceStoppedError, match="service cannot be connected to"):
-        Client("service", service.server.address)
+        service.client()
 
 
 def test_what_a_client_that_is_gone_had_asked_is_forgotten(service: Service):
-    client = Client("service", service.server.address)
+    client = service.client()
     client.send(("hold", np.zeros(100_000)))
     ask(client, ("echo", None))
     (request,) = service.held
@@ -208,7 +192,7 @@ def test_what_a_client_that_is_gone_had_asked_is_forgotten(service: Service):
 def test_who_does_not_know_the_key_is_refused_before_anything_is_read(service: Service):
     address = service.server.address
     with pytest.raises(ServiceStoppedError, match="cannot be connected to"):
-        Client("service", Address(address.at, b"another key"))
+        Client("service", transport.Address(address.at, b"another key"))
     family = socket.AF_UNIX if isinstance(address.at, str) else socket.AF_INET
     with socket.socket(family) as end:
         end.connect(address.at)
@@ -219,104 +203,60 @@ def test_who_does_not_know_the_key_is_refused_before_anything_is_read(service: S
 def test_a_message_is_as_old_as_its_sender_says_if_that_can_be(monkeypatch: pytest.MonkeyPatch):
     taken: list[PendingRequest] = []
     server = Server(taken.append)
-    clients = [Client("service", server.address) for _ in range(2)]
-    for client in clients:
-        client.send("a first one")
+    client = Client("service", server.address)
+    before = time.monotonic()
+    client.send("now")
+    time.sleep(0.1)
+    monkeypatch.setattr(transport.time, "monotonic", lambda now=time.monotonic: now() - 1e6)
+    client.send("of a node that has just been started")
+    monkeypatch.undo()
     while len(taken) < 2:
         server.poll(1.0)
-    taken.clear()
-    for client in (*clients, *clients):
-        client.send("now")
-    monkeypatch.setattr(transport.time, "monotonic", lambda now=time.monotonic: now() - 1e6)
-    clients[0].send("of a node that has just been started")
-    monkeypatch.undo()
-    while len(taken) < 5:
-        server.poll(1.0)
-    assert all(0 <= time.monotonic() - request.sent < 60 for request in taken)
-    times = [request.sent for request in taken if request.message == "now"]
-    assert times == sorted(times)
+    assert 0 <= taken[0].sent - before < 0.1, "it was read later"
+    assert 0 <= time.monotonic() - taken[1].sent < 60
     server.close()
 
 
-class MortalService:
-    """Answers when the test says so; may be away, or die while it is asked."""
-
-    def __init__(self) -> None:
-        self.held: list[tuple[str, Future[Any]]] = []
-        self.state = "there"
-
-    def become(self, state: str) -> None:
-        self.state = state
-        if state != "there":
-            for _, future in self.held:
-                future.set_exception(ServiceStoppedError("the service has stopped"))
-            self.held.clear()
-
-    def connect(self, timeout_s: float = 0.0) -> Any:
-        if self.state == "away":
-            raise ServiceStoppedError("nobody listens there")
-        return PlayedClient("inference", self._take)
-
-    def answer(self, number: int = 0) -> None:
-        message, future = self.held.pop(number)
-        future.set_result(f"answer to {message}")
-
-    def _take(self, message: str) -> Future[Any]:
-        if self.state == "dying":
-            raise ServiceStoppedError("it dies")
-        self.held.append((message, Future()))
-        return self.held[-1][1]
-
-
-@pytest.fixture(autouse=True)
-def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_not_answered_is_asked_again_in_order_under_the_same_ticket(monkeypatch: Any):
     monkeypatch.setattr(transport, "RETRY_S", 0.0)
+    services = [Service(None)]
+    client: Any = ReconnectingClient(SimpleNamespace(connect=lambda timeout_s: services[-1].client()))
+    tickets = [client.send(message) for message in (("hold", "a"), ("echo", "b"), ("hold", "c"))]
+    assert client.done(LONG_S) == [(tickets[1], "b")]
+    services[-1].close()
+    assert client.done(LONG_S) == []
+    tickets += [client.send(("hold", "d"))]  # while nobody is there
+    for _ in range(2):  # the second one is lost as well
+        assert client.done(0.0) == []
+        services.append(Service(None))
+        assert client.done(0.0) == [] and eventually(lambda: len(services[-1].held) == 3)
+        assert [request.message[1] for request in services[-1].held] == ["a", "c", "d"]
+        if len(services) == 2:
+            services[-1].close()
+            assert client.done(LONG_S) == []
+    tickets += [client.send(("release", "e"))]
+    del tickets[1]
+    assert awaited(client, tickets) == ["a", "c", "d", "e"]
+    services[-1].close()
 
 
-@pytest.mark.parametrize("lost", ["away", "dying"])
-def test_what_was_not_answered_is_asked_again_in_order_and_under_the_same_ticket(lost: str):
-    service = MortalService()
-    client = ReconnectingClient(service)
-    a, b, c = (client.send(name) for name in "abc")
-    service.answer(1)
-    assert client.done(60.0) == [(b, "answer to b")]
-    service.become(lost)
-    assert client.done(0.0) == []
-    d = client.send("d")  # while nobody is there
-    assert client.done(0.0) == [] and not service.held
-    service.become("there")
-    assert client.done(0.0) == [] and [message for message, _ in service.held] == ["a", "c", "d"]
-    for _ in range(3):
-        service.answer()
-    assert sorted(client.done(60.0)) == [(a, "answer to a"), (c, "answer to c"), (d, "answer to d")]
-
-
-def copied(tensors: Tensors) -> Tensors:
-    """Copies as Ray's object store would have made them."""
-    return {name: tensor.copy() for name, tensor in tensors.items()}
-
-
-def test_a_replica_gets_the_newest_set_and_skips_those_before():
-    publisher, tensor = WeightPublisher(["inference"], copied), np.zeros(3)
+def test_a_replica_gets_the_newest_set_and_waits_for_a_newer_one_not_for_ever(monkeypatch: Any):
+    publisher, tensor = WeightPublisher(["inference"], copy.deepcopy), np.zeros(3)
     for version in range(5):
         tensor[:] = version
         publisher.publish(version, {"w": tensor})
     tensor[:] = -1
     version, (newest,) = publisher.newer_than("inference", -1)
     assert version == 4 and (newest["w"] == 4).all()
-
-
-def test_a_replica_waits_for_newer_weights_but_not_for_ever(monkeypatch: pytest.MonkeyPatch):
-    publisher = WeightPublisher(["inference"], copied)
-    threading.Timer(0.05, publisher.publish, (3, {})).start()
-    assert publisher.newer_than("inference", -1) == (3, [{}])
+    threading.Timer(0.05, publisher.publish, (5, {})).start()
+    assert publisher.newer_than("inference", 4) == (5, [{}])
     monkeypatch.setattr(worker, "ASK_S", 0.01)
-    assert publisher.newer_than("inference", 3) == (3, [])
+    assert publisher.newer_than("inference", 5) == (5, [])
 
 
 def test_flush_waits_until_each_replica_has_applied_the_newest(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(worker, "ASK_S", 0.0)
-    publisher = WeightPublisher(["inference 0", "inference 1"], copied)
+    publisher = WeightPublisher(["inference 0", "inference 1"], copy.deepcopy)
     publisher.flush(30)
     publisher.publish(1, {})
     publisher.newer_than("inference 0", 1)

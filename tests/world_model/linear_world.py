@@ -53,12 +53,10 @@ class LinearWorldModel(LearnableWorldModel):
         self.scale.copy_(moved.std(0).clamp(min=1e-3))
 
     def begin(self, context: Context, tasks: Sequence[str]) -> State:
-        """See the base class."""
         return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
     @torch.no_grad()
     def step(self, state: State, actions: Tensor) -> Prediction:
-        """See the base class."""
         robot = state["robot"] + self._moved(actions)
         return Prediction(state=state | {"robot": robot}, frames=state["frames"], robot=robot)
 

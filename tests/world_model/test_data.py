@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Windows whose numbers are known by hand, and LeRobotDatasets as episodes."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,18 +14,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from accerl_lerobot.engines.config import DatasetConfig
-from accerl_lerobot.envs import SimulatedConfig, make_environment
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import contract
-from accerl_lerobot.world_model.contract import (
-    Episode,
-    Windows,
-    WindowStart,
-    WorldModelSpec,
-    cut_windows,
-    load_episodes,
-    starts_of,
-)
+from accerl_lerobot.world_model.contract import Episode, WindowStart, WorldModelSpec, cut_windows
 from tests.tiny_datasets import record_dataset
 
 K = 3
@@ -33,22 +26,20 @@ SPEC = WorldModelSpec(
 )  # fmt: skip
 
 
-def an_episode(steps: int = 8, *, every: int = 1, success: bool = False, last: bool = False) -> Episode:
-    """Frame and state say which env step they show; action i is (i, −i)."""
-    times = np.arange(0, steps, every)
-    if last:
-        times = np.append(times, steps)
+def an_episode(steps: int, times: Sequence[int] | None = None, success: bool = False) -> Episode:
+    """Frame and state say which env step they show, by default each but the last; action i is (i, −1 − i)."""
+    at = np.arange(steps) if times is None else np.array(times)
     return Episode(
-        frames=np.broadcast_to(times[:, None, None, None, None], (len(times), 1, 2, 2, 3)).astype(np.uint8),
-        times=times.astype(np.int64),
-        state=times[:, None].astype(np.float32),
-        actions=np.stack([np.arange(steps), -np.arange(steps)], 1).astype(np.float32),
+        frames=np.broadcast_to(at[:, None, None, None, None], (len(at), 1, 2, 2, 3)).astype(np.uint8),
+        times=at,
+        state=at[:, None].astype(np.float32),
+        actions=np.stack([np.arange(steps), -1 - np.arange(steps)], 1).astype(np.float32),
         success=success,
         task="go",
     )
 
 
-def cut(episode: Episode, frame: int, chunks: int | None) -> Windows:
+def cut(episode: Episode, frame: int, chunks: int | None) -> Any:
     return cut_windows([WindowStart(episode, frame)], SPEC, chunks)
 
 
@@ -65,14 +56,7 @@ def test_a_window_inside_an_episode():
     assert windows.actions[0, :, :, 0].tolist() == [[7, 8, 9], [10, 11, 12]]
     assert windows.steps.tolist() == [[3, 3]] and windows.known.all() and not windows.success.any()
     assert windows.tasks == ("go",) and shown(context.first_frame) == 0 == context.first_robot.item()
-    assert context.commanded_sum.tolist() == [[21, -21]], "actions 0 to 6"
-
-
-def test_the_context_stops_at_the_first_frame():
-    context = cut(an_episode(20), 1, 1).context
-    assert shown(context.frames) == [0, 1] and context.actions[0, :, 1].tolist() == [0, 0, 0]
-    context = cut(an_episode(20), 2, 1).context
-    assert context.actions[0, :, 1].tolist() == [0, 0, -1]
+    assert context.commanded_sum.tolist() == [[21, -28]], "actions 0 to 6"
 
 
 def test_an_episode_that_ends_within_a_chunk_repeats_its_last_frame_and_action():
@@ -85,40 +69,31 @@ def test_an_episode_that_ends_within_a_chunk_repeats_its_last_frame_and_action()
 
 
 def test_an_episode_with_a_frame_for_each_decision():
-    episode = an_episode(8, every=K, success=True, last=True)
-    assert episode.times.tolist() == [0, 3, 6, 8] and len(starts_of([episode, episode])) == 6
+    episode = an_episode(8, [0, 3, 6, 8], success=True)
+    assert len(contract.starts_of([episode, episode])) == 6
     whole, third = cut(episode, 0, None), cut(episode, 2, 2)
     assert shown(whole.context.frames) == [0, 0] and shown(whole.frames) == [3, 6, 8]
+    assert not whole.context.actions.any(), "there were none before"
     assert whole.steps.tolist() == [[3, 3, 2]] and whole.success.tolist() == [[False, False, True]]
     assert shown(third.context.frames) == [3, 6] and shown(third.frames) == [8, 8]
     assert third.known.tolist() == [[True, False]] == third.success.tolist()
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, WorldModelSpec]:
-    """Six episodes of the simulated environment, some of which fail."""
-    root = tmp_path_factory.mktemp("demos") / "dataset"
+def test_every_frame_and_action_is_the_dataset_s_once(tmp_path: Path):
+    """Of episodes of which some fail, in a dataset that has each of them twice."""
     env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-    dataset = record_dataset(root, env, episodes=6, failure_share=0.5)
-    return dataset, replace(SPEC, fps=make_environment(env).spec.fps)
-
-
-def test_every_frame_and_action_is_the_dataset_s_once(
-    recorded: tuple[DatasetConfig, WorldModelSpec], tmp_path: Path
-):
-    dataset, spec = recorded
+    dataset = record_dataset(tmp_path / "once", env, episodes=6, failure_share=0.5)
     rows = LeRobotDataset("a/b", root=dataset.root)
     merge_datasets([rows, rows], output_repo_id="a/b", output_dir=tmp_path / "twice")
-    episodes = load_episodes(replace(dataset, root=str(tmp_path / "twice")), spec)
-    assert len(episodes) == rows.meta.total_episodes == 6
-    assert sum(len(episode.actions) for episode in episodes) == len(rows)
+    episodes = contract.load_episodes(replace(dataset, root=str(tmp_path / "twice")), SPEC)
+    assert len(episodes) == 6 and sum(len(episode.actions) for episode in episodes) == len(rows)
     index = 0
     for episode in episodes:
-        assert episode.task in rows.meta.tasks.index
+        assert episode.task == "Match the target"
         successes = []
         for t in range(len(episode.actions)):
             row = rows[index + t]
-            image = (row[spec.cameras[0]] * 255).round().numpy()
+            image = (row[SPEC.cameras[0]] * 255).round().numpy()
             assert np.array_equal(episode.frames[t, 0].transpose(2, 0, 1), image)
             assert np.array_equal(episode.state[t], row["observation.state"].numpy())
             assert np.array_equal(episode.actions[t], row["action"].numpy())
@@ -139,15 +114,10 @@ def test_every_frame_and_action_is_the_dataset_s_once(
     ],
 )
 def test_what_cannot_be_learned_from(changes: dict[str, Any], why: str, monkeypatch: pytest.MonkeyPatch):
-    shapes: dict[str, Any] = {
-        "observation.images.front": (16, 16, 3), "observation.state": (4,), "action": (2,),
-        "next.success": (1,),
-    }  # fmt: skip
-    fps = changes.get("fps", 80)
-    for name, shape in changes.items():
-        shapes[name] = shape
+    shapes: dict[str, Any] = {"observation.images.front": (16, 16, 3), "observation.state": (4,)}
+    shapes |= {"action": (2,), "next.success": (1,)} | changes
     features = {name: {"shape": shape} for name, shape in shapes.items() if isinstance(shape, tuple)}
-    meta = SimpleNamespace(features=features, fps=fps, camera_keys=[])
+    meta = SimpleNamespace(features=features, fps=changes.get("fps", 80), camera_keys=[])
     monkeypatch.setattr(contract, "open_metadata", lambda dataset: meta)
     with pytest.raises(InputError, match=f"^dataset.repo_id='a/b': {why}"):
         contract.check_dataset(DatasetConfig(repo_id="a/b"), SPEC)

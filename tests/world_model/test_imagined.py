@@ -2,7 +2,6 @@
 """An imagined environment, on a world whose every number is known; a world model that learns in a run."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,13 +15,14 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.experience import IMAGINED, TASK, Decision, Segment
-from accerl_lerobot.rollout.runner import ActiveEpisode, EpisodePlan
+from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model import training
 from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.contract import Episode, Prediction, WorldModelSpec, episode_of, model_arrays
+from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec, episode_of, model_arrays
 from accerl_lerobot.world_model.imagined import ImaginedEnvironment, World
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.training import Trainer, draw, starts_of
+from tests.rollout.environments import Recorder, explore
 
 CAMERA, K = "observation.images.front", 4
 WORLD = SimulatedConfig(max_steps=16, image_size=16, hold=6, tolerance=0.2)
@@ -31,21 +31,17 @@ SPEC = WorldModelSpec(cameras=(CAMERA,), image_size=(16, 16), state_dim=4, actio
 
 def real_episode(seed: int, *, solve_at: int = 99) -> Segment:
     """An episode of random chunks, which are right from decision `solve_at` on."""
-    environment = make_environment(WORLD)
-    rng = np.random.default_rng(seed)
-    plan = EpisodePlan(task="match", seed=seed, explore=True)
-    episode = ActiveEpisode(plan, environment.spec.max_steps, [environment.reset(seed, "match")])
-    for t in range(99):
+    environment: Any = make_environment(WORLD)
+    recorder = Recorder([environment], [explore(seed, "match")], RolloutConfig(segment_length=99))
+    rng, made, due = np.random.default_rng(seed), 0, recorder.runner.start(0)
+    while due is not None:
         chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)
-        if t >= solve_at:
-            chunk = np.repeat(environment.solution[None].astype(np.float32), K, 0)  # type: ignore[attr-defined]
-        result = environment.step_chunk(chunk)
-        zero = np.zeros(1, np.float32)
-        decision = Decision(chunk=chunk, latent={"x": chunk.ravel()}, log_prob=zero, version=0)
-        episode.add(decision, chunk, 0.0, result.steps, result.observation)
-        if result.done:
-            break
-    return episode.cut(f"{seed}", result.done, result.success)
+        if made >= solve_at:
+            chunk[:] = environment.solution
+        made += 1
+        decision = Decision(chunk=chunk, latent={}, log_prob=np.zeros(1, np.float32), version=0)
+        due = recorder.runner.advance(0, decision)
+    return recorder.segments[0]
 
 
 class CountingWorld:
@@ -59,11 +55,9 @@ class CountingWorld:
         return {"frames": torch.tensor(frames), "robot": torch.tensor(robot)}
 
     def step(self, state: dict[str, torch.Tensor], actions: np.ndarray) -> Prediction:
-        frames = state["frames"] + 1
-        robot = state["robot"].clone()
+        frames, robot = state["frames"] + 1, state["robot"].clone()
         robot[0] += float(actions.sum())
-        following = {"frames": frames, "robot": robot}
-        return Prediction(state=following, frames=frames[None], robot=robot[None])
+        return Prediction({"frames": frames, "robot": robot}, frames=frames[None], robot=robot[None])
 
     def succeeds(self, frames: np.ndarray, task: str) -> bool:
         return int(frames.reshape(-1)[0]) - 7 == self._success_at
@@ -82,16 +76,11 @@ def environment(world: Any, *starts: tuple[str, dict[str, Any]]) -> ImaginedEnvi
 CHUNK = np.full((K, 2), 0.5, np.float32)
 
 
-def test_an_episode_begins_at_the_start_that_its_seed_names():
-    made = environment(CountingWorld(), start(7), start(9))
-    for seed, value in ((4, 7), (5, 9)):
+def test_an_episode_begins_at_the_start_that_its_seed_names_and_a_chunk_is_one_prediction():
+    made = environment(CountingWorld(), start(9), start(7))
+    for seed, value in ((4, 9), (5, 7)):
         first = made.reset(seed, "match")
         assert first[CAMERA].min() == value == first[CAMERA].max() and first[TASK] == "do it"
-
-
-def test_a_chunk_is_one_prediction():
-    made = environment(CountingWorld())
-    made.reset(0, "match")
     result = made.step_chunk(CHUNK)
     assert result.observation[CAMERA].max() == 8 and result.observation["observation.state"][0] == 4.0
     assert result.rewards.tolist() == [0.0] * K and not result.done
@@ -108,36 +97,24 @@ def test_success_ends_it_and_pays_once_or_the_time_limit_ends_it(success_at: int
     assert last.rewards.tolist() == [0.0] * (K - 1) + [float(succeeds)]
 
 
-def test_an_episode_under_way_goes_on_from_its_state():
-    made, other = environment(CountingWorld()), environment(CountingWorld())
-    made.reset(3, "match")
-    made.step_chunk(CHUNK)
-    other.restore(made.state())
-    one, two = made.step_chunk(CHUNK), other.step_chunk(CHUNK)
-    assert np.array_equal(one.observation[CAMERA], two.observation[CAMERA])
-    assert np.array_equal(one.observation["observation.state"], two.observation["observation.state"])
-
-
 def world() -> World:
     torch.manual_seed(0)
     return World(PixelWorldModel(SPEC, PixelModelConfig(channels=(8, 8))))
 
 
 def test_a_batch_of_one_is_what_the_models_say():
-    """The environment's own calls, against the model's."""
     given = world().eval()
     made = environment(given, start(100))
     made.reset(0, "match")
     result = made.step_chunk(CHUNK)
-    frames = np.full((1, 16, 16, 3), 100, np.uint8)
-    state = given.begin(frames, np.zeros(4, np.float32), "do it")
+    state = given.begin(np.full((1, 16, 16, 3), 100, np.uint8), np.zeros(4, np.float32), "do it")
     prediction = given.model.step(state, torch.from_numpy(CHUNK[None]))
     assert np.array_equal(result.observation[CAMERA], prediction.frames[0, 0].numpy())
     np.testing.assert_allclose(result.observation["observation.state"], prediction.robot[0].numpy())
 
 
-def learner(steps_per_episode: float = 2.0, recorded: Sequence[Episode] = ()) -> Trainer:
-    return Trainer(world(), recorded, 3e-4, steps_per_episode=steps_per_episode)
+def learner(steps_per_episode: float = 2.0) -> Trainer:
+    return Trainer(world(), [], 3e-4, steps_per_episode=steps_per_episode)
 
 
 def episodes(*outcomes: bool) -> list[Segment]:
@@ -198,15 +175,14 @@ def test_it_goes_on_from_its_state_and_a_world_takes_its_weights_over(tmp_path: 
         one.add(segment)
     one.step()
     snapshot.save(tmp_path / "learner", one.state())
-    other = learner()
+    other, taken = learner(), world()
     other.restore(snapshot.load(tmp_path / "learner"))
-    assert other.pending_steps == one.pending_steps == 3 and other.serving.version == 1
+    assert other.pending_steps == one.pending_steps == 3
     made = []
     for each in (one, other):
         torch.manual_seed(5)
         made.append(each.step())
     assert made[0] == made[1]
-    taken = world()
     taken.load(other.serving.version, copied(other.serving))
     assert taken.version == 2
     ours, theirs = copied(one.serving), copied(taken)

@@ -9,24 +9,21 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
+from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.config.parsing import parse
-from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import make_environment
+from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.world_model.config import StateModelConfig
 from accerl_lerobot.world_model.states import StateSpec, new_state_model
-from tests.runs import drive, tiny_run
+from tests.runs import off_policy_run, trained, updates
 
 SOURCE = Path(__file__).parents[1] / "packages" / "accerl_world_model_lewm"
 PACKAGE = SOURCE.name
@@ -61,25 +58,17 @@ def config(monkeypatch: pytest.MonkeyPatch) -> Iterator[RunConfig]:
 def test_it_learns_in_a_run(config: RunConfig, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     model: Any = importlib.import_module(f"{PACKAGE}.model").LeWMState
     monkeypatch.setattr(model, "first_steps", 3)
-    monkeypatch.setattr(model, "steps_per_decision", 0.02)
-    tiny = tiny_run(
-        tiny_checkpoint,
-        algorithm=config.algorithm,
-        world_model=config.world_model,
-        rollout=RolloutConfig(environments=4, segment_length=4),
-        replay=ReplayConfig(
-            capacity=512, min_decisions=160, max_unlearned_decisions=320, samples_per_insert=1
-        ),
-        trainer=TrainerConfig(updates=2, batch_decisions=160, warmup_updates=0, value_warmup_updates=1),
-        launch=LaunchConfig(engine="local"),
+    monkeypatch.setattr(model, "steps_per_decision", 0.2)
+    monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 8)
+    trainer = TrainerConfig(updates=2, batch_decisions=16, warmup_updates=0, value_warmup_updates=1)
+    run = off_policy_run(
+        tiny_checkpoint, algorithm=config.algorithm, world_model=config.world_model, trainer=trainer
     )
-    engine: Any = make_engine(tiny, make_environment(tiny.env).spec, history=1)
-    engine.train()
-    updates = [update for progress in drive(engine) for update in progress.updates]
-    engine.close()
-    assert len(updates) == 2 and "stable_worldmodel" not in sys.modules
-    assert all(update["world_model_prediction"] > 0 < update["world_model_sigreg"] for update in updates)
-    learner, acting = engine._update.state_learner, engine._update.teacher.model.state_dict()
+    history, engine = trained(run)
+    found, update = updates(history), cast(Any, engine._update)
+    assert len(found) == 2 and "stable_worldmodel" not in sys.modules
+    assert all(each["world_model_prediction"] > 0 < each["world_model_sigreg"] for each in found)
+    learner, acting = update.state_learner, update.teacher.model.state_dict()
     assert learner.count >= 6
     assert acting["lewm.projector.net.1.running_mean"].abs().max() > 0, "buffers are handed over, too"
     for name, tensor in learner.model.state_dict().items():

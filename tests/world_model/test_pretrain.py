@@ -2,7 +2,6 @@
 """accerl world-model from a dataset to its check, saved and loaded again; of our model and of another's."""
 
 import json
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,19 +27,6 @@ PACKAGE = "tests.world_model.linear_world"
 NAMED = [f"--world_model.discover_packages_path={PACKAGE}", "--world_model.model.type=linear"]
 
 
-def forget() -> None:
-    LearnableModelConfig.get_known_choices().pop("linear", None)
-    sys.modules.pop(PACKAGE, None)
-
-
-@pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
-    """Whoever does not import the package of the linear model fails."""
-    forget()
-    yield
-    forget()
-
-
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("demos") / "dataset"
@@ -57,9 +43,12 @@ def arguments(demos: Path, output_dir: Path, *more: str) -> list[str]:
     return replacing(told, *more)
 
 
-def test_from_a_dataset_to_a_check_and_another_check(
-    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def check_again(demos: Path, trained: Path, again: Path, *more: str) -> int:
+    told = ["world-model-eval", f"--path={trained / 'world_model'}", "--dataset.repo_id=a/b", "--device=cpu"]
+    return cli.main([*told, f"--dataset.root={demos}", f"--output_dir={again}", *more])
+
+
+def test_from_a_dataset_to_a_check_and_another_check(demos: Path, tmp_path: Path, capsys: Any):
     out = tmp_path / "out"
     code = cli.main(arguments(demos, out, "--world_model.model.channels=16,24"))
     stdout, stderr = capsys.readouterr()
@@ -76,8 +65,7 @@ def test_from_a_dataset_to_a_check_and_another_check(
     assert float(world.success.threshold) == pytest.approx(found["threshold"])
     assert world.failed_checks == found["failed"] and world.tasks == ["Match the target"]
     assert len(world.learnt) + found["episodes"] == 12
-    told = ["world-model-eval", f"--path={out / 'world_model'}", "--dataset.repo_id=a/b"]
-    cli.main([*told, f"--dataset.root={demos}", f"--output_dir={tmp_path / 'again'}", "--device=cpu"])
+    check_again(demos, out, tmp_path / "again")
     again = json.loads(capsys.readouterr().out)
     assert all(again[name] == found[name] for name in CHECKS), "of its own dataset, those held out"
 
@@ -89,51 +77,31 @@ def test_what_cannot_be_held_out(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert not (tmp_path / "out").exists()
 
 
-def test_a_model_of_another_package_is_learned_and_checked_by_naming_it(
-    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    out = tmp_path / "out"
+@pytest.fixture
+def forget() -> Iterator[Callable[[], None]]:
+    """Whoever does not import the package of the linear model fails."""
+
+    def forgotten() -> None:
+        LearnableModelConfig.get_known_choices().pop("linear", None)
+        sys.modules.pop(PACKAGE, None)
+
+    forgotten()
+    yield forgotten
+    forgotten()
+
+
+def test_a_model_of_another_package_is_named(forget: Any, demos: Path, tmp_path: Path, capsys: Any):
+    out, again = tmp_path / "out", tmp_path / "again"
     cli.main(arguments(demos, out, *NAMED, "--world_model.steps=300", "--world_model.lr=0.03"))
     found = json.loads(capsys.readouterr().out)
-    losses = records(out)
-    assert 0 < losses[-1]["motion"] < 0.5, "in usual motions; of one that knows nothing it is 1 or more"
+    assert 0 < records(out)[-1]["motion"] < 0.5, "in usual motions; of one that knows nothing it is 1 or more"
     assert "skill" in found["failed"], "its pictures never change"
-    told = ["world-model-eval", f"--path={out / 'world_model'}", "--dataset.repo_id=a/b", "--device=cpu"]
-    told += [f"--dataset.root={demos}", f"--output_dir={tmp_path / 'again'}"]
     forget()
-    assert cli.main(told) == 2
+    assert check_again(demos, out, again) == 2
     assert "name that: discover_packages_path" in capsys.readouterr().err
-    cli.main([*told, f"--discover_packages_path={PACKAGE}"])
-    again = json.loads(capsys.readouterr().out)
-    assert all(again[name] == found[name] for name in CHECKS)
-
-
-def reconfigured(folder: Path, **changes: Any) -> None:
-    """Puts other values into a world model's ``config.json``."""
-    content = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(content | changes))
-
-
-def not_finite(folder: Path) -> None:
-    tensors = load_file(folder / "model.safetensors")
-    save_file(tensors | {"model.change": tensors["model.change"] * torch.nan}, folder / "model.safetensors")
-
-
-@pytest.mark.parametrize(
-    ("harm", "why"),
-    [
-        (shutil.rmtree, "config.json: is missing"),
-        (lambda folder: reconfigured(folder, spec=1), "not a world model of accerl world-model"),
-        (lambda folder: reconfigured(folder, learnt=7), "not a world model of accerl world-model"),
-        (lambda folder: (folder / "model.safetensors").write_bytes(bytes(64)), "not safetensors"),
-        (not_finite, "model.safetensors: model.change holds NaN or infinity; train it again"),
-    ],
-)
-def test_what_cannot_be_loaded(tmp_path: Path, harm: Callable[[Path], object], why: str):
-    save_world(tmp_path / "w", World(model()))
-    harm(tmp_path / "w")
-    with pytest.raises(InputError, match=f"^path=.*{why}"):
-        load_world(tmp_path / "w")
+    check_again(demos, out, again, f"--discover_packages_path={PACKAGE}")
+    checks = json.loads(capsys.readouterr().out)
+    assert all(checks[name] == found[name] for name in CHECKS)
 
 
 def test_it_is_saved_as_it_is_used(tmp_path: Path):
@@ -149,3 +117,27 @@ def test_it_is_saved_as_it_is_used(tmp_path: Path):
     saved = load_file(tmp_path / "twice" / "model.safetensors")
     for name, value in world.state_dict().items():
         assert torch.equal(value, saved[name]), name
+
+
+@pytest.mark.parametrize(
+    ("config", "tensors", "why"),
+    [
+        (None, {}, "config.json: is missing"),
+        ({"spec": 1}, {}, "not a world model of accerl world-model"),
+        ({"learnt": 7}, {}, "not a world model of accerl world-model"),
+        ({}, None, "not safetensors"),
+        ({}, {"model.change": torch.tensor(torch.nan)}, "model.change holds NaN or infinity; train it again"),
+    ],
+)
+def test_what_cannot_be_loaded(tmp_path: Path, config: dict | None, tensors: dict | None, why: str):
+    folder = tmp_path / "w"
+    save_world(folder, World(model()))
+    content, weights = folder / "config.json", folder / "model.safetensors"
+    content.write_text(json.dumps(json.loads(content.read_text()) | (config or {})))
+    save_file(load_file(weights) | (tensors or {}), weights)
+    if config is None:
+        content.unlink()
+    if tensors is None:
+        weights.write_bytes(bytes(64))
+    with pytest.raises(InputError, match=f"^path=.*{why}"):
+        load_world(folder)

@@ -12,14 +12,16 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import tdmpc
 from accerl_lerobot.world_model.config import TDMPCStateConfig
-from accerl_lerobot.world_model.states import StateLearner, StateSpec, Transitions, new_state_model
+from accerl_lerobot.world_model.states import StateLearner, StateSpec, new_state_model
 from accerl_lerobot.world_model.tdmpc import TDMPCModel
 from tests.policies.checkpoints import write_policy
 from tests.policies.test_stock import KINDS
+from tests.world_model.test_latent import FRONT, ROBOT, transitions
 
-CAMERA, IMAGE, ROBOT = "observation.images.front", "observation.image", "observation.state"
+IMAGE = "observation.image"
 UNITS = (np.array([0.5, -1.0], np.float32), np.array([2.0, 0.25], np.float32))
 """Zero and scale of the policy that practises; TD-MPC normalises by the range of its own dataset."""
+SPEC = StateSpec(cameras={FRONT: 3}, state=4, environment_state=0, chunk=(3, 2), units=UNITS)
 
 
 @pytest.fixture(scope="module")
@@ -28,44 +30,18 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_policy(folder, "tdmpc", image=64, camera=IMAGE, **KINDS["tdmpc"])
 
 
-def spec_of(written: Path) -> StateSpec:
-    config: Any = get_policy_class("tdmpc").from_pretrained(written).config
-    state = config.robot_state_feature.shape[0]
-    return StateSpec(cameras={CAMERA: 3}, state=state, environment_state=0, chunk=(3, 2), units=UNITS)
-
-
-def transitions(spec: StateSpec, count: int = 6) -> Transitions:
-    rng = np.random.default_rng(0)
-
-    def seen() -> dict[str, np.ndarray]:
-        images = rng.integers(0, 256, (count, 64, 64, 3), np.uint8)
-        return {CAMERA: images, ROBOT: rng.standard_normal((count, spec.state)).astype(np.float32)}
-
-    return Transitions(
-        observations=seen(),
-        following=seen(),
-        tasks=["a"] * count,
-        elapsed=torch.linspace(0, 1, count),
-        chunk=torch.from_numpy(rng.uniform(-1, 1, (count, *spec.chunk)).astype(np.float32)),
-        returns=torch.from_numpy(rng.random(count, dtype=np.float32)),
-        success=torch.ones(count, dtype=torch.bool),
-    )
-
-
 def test_state_and_loss_are_those_of_lerobot_s_networks(written: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tdmpc, "shifted", lambda images: images)
-    spec = spec_of(written)
-    made = new_state_model(spec, TDMPCStateConfig(path=str(written)))
+    made = new_state_model(SPEC, TDMPCStateConfig(path=str(written)))
     assert isinstance(made, TDMPCModel) and made.learns
     policy: Any = get_policy_class("tdmpc").from_pretrained(written)
     pre, post = make_pre_post_processors(policy.config, pretrained_path=str(written))
-    batch = transitions(spec)
+    batch = transitions(6, 0, state=4, chunk=3)
 
     def latent(model: Any, observations: dict[str, np.ndarray]) -> torch.Tensor:
-        images = torch.from_numpy(observations[CAMERA]).permute(0, 3, 1, 2).float() / 255
+        images = torch.from_numpy(observations[FRONT]).permute(0, 3, 1, 2).float() / 255
         inputs = {IMAGE: images, ROBOT: torch.from_numpy(observations[ROBOT]), "task": ["a"] * 6}
-        processed = pre(inputs)
-        return model.encode({IMAGE: processed[IMAGE], ROBOT: processed[ROBOT]})
+        return model.encode({name: pre(inputs)[name] for name in (IMAGE, ROBOT)})
 
     with torch.no_grad():
         z = latent(policy.model, batch.observations)
@@ -89,22 +65,20 @@ def test_state_and_loss_are_those_of_lerobot_s_networks(written: Path, monkeypat
 
 
 def test_it_learns_or_stays_as_it_is(written: Path):
-    spec = spec_of(written)
-    learner = StateLearner(new_state_model(spec, TDMPCStateConfig(path=str(written))))
+    learner = StateLearner(new_state_model(SPEC, TDMPCStateConfig(path=str(written))))
     slow = [parameter.clone() for parameter in learner.model.slow.parameters()]
-    batch = transitions(spec, 64)
+    batch = transitions(64, 0, state=4, chunk=3)
     for _ in range(30):
         learner.submit(batch, {})
     losses = [20 * parts["consistency"] + 0.5 * parts["return"] for parts in learner.collect()]
     assert losses[-1] < 0.8 * losses[0]
     assert not all(map(torch.equal, slow, learner.model.slow.parameters()))
-    still = new_state_model(spec, TDMPCStateConfig(path=str(written), learn=False))
+    still = new_state_model(SPEC, TDMPCStateConfig(path=str(written), learn=False))
     assert not still.learns and not any(parameter.requires_grad for parameter in still.parameters())
 
 
 def test_what_does_not_fit_is_one_line(written: Path, tmp_path: Path):
-    spec = spec_of(written)
-    other = write_policy(tmp_path / "vqbet", "vqbet", image=64, camera=CAMERA, **KINDS["vqbet"])
+    other = write_policy(tmp_path / "vqbet", "vqbet", image=64, camera=FRONT, **KINDS["vqbet"])
     for path, change, message in (
         (None, {}, "world_model.path=None: give the pretrained_model"),
         (str(tmp_path / "nowhere"), {}, "world_model.path="),
@@ -114,8 +88,8 @@ def test_what_does_not_fit_is_one_line(written: Path, tmp_path: Path):
         (str(written), {"cameras": {"observation.images.a": 3, "observation.images.b": 3}}, "it sees observ"),
     ):
         with pytest.raises(InputError, match=message):
-            new_state_model(spec._replace(**change), TDMPCStateConfig(path=path))
-    made = new_state_model(spec, TDMPCStateConfig(path=str(written)))
-    small = {CAMERA: np.zeros((1, 32, 32, 3), np.uint8), ROBOT: np.zeros((1, spec.state), np.float32)}
+            new_state_model(SPEC._replace(**change), TDMPCStateConfig(path=path))
+    made = new_state_model(SPEC, TDMPCStateConfig(path=str(written)))
+    small = {FRONT: np.zeros((1, 32, 32, 3), np.uint8), ROBOT: np.zeros((1, SPEC.state), np.float32)}
     with pytest.raises(InputError, match=r"world_model.path=.*\(3, 64, 64\), the run's \(3, 32, 32\)"):
         made.encode(small, ["a"], np.zeros(1))
