@@ -137,9 +137,7 @@ class LightTrainer:
         return self._publisher.newer_than(reader, version)
 
     def metrics(self) -> list[dict[str, float]]:
-        with self._lock:
-            records, self._records = self._records, []
-        return records
+        return self.hold()[1]
 
     def hold(self) -> tuple[int, list[dict[str, float]]]:
         with self._lock:

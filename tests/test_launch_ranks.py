@@ -11,25 +11,18 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.stopping import WorkerError
 from tests.runs import drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening
 
-UPDATES = 6
-TWO = TrainerConfig(
-    updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,
-    ranks=2, sharding="zero3",
-)  # fmt: skip
-
 
 @pytest.mark.slow
 def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoint: Path, tmp_path: Path):
-    config = tiny_run(tiny_checkpoint, trainer=TWO, launch=LaunchConfig(stall_s=25.0))
+    two = {"updates": 1000, "warmup_updates": 0, "value_warmup_updates": 1, "ranks": 2, "sharding": "zero3"}
+    config = tiny_run(tiny_checkpoint, trainer=two | {"probe_every": 3}, launch={"stall_s": 25.0})
     with closing(RayEngine(config, ("match",))) as engine:
         pids = engine.pids()
         engine.train()
@@ -38,7 +31,7 @@ def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoi
             updates += progress.updates
             served = int(progress.inference.get("version", 0.0))
             probes = [u["logprob/mismatch_max"] for u in updates if "logprob/mismatch_max" in u]
-            if progress.version >= UPDATES and served > 0 and len(probes) >= 2:
+            if progress.version >= 6 and served > 0 and len(probes) >= 2:
                 break
         saved, addresses = engine.save(tmp_path), set(listening())
         os.kill(pids["trainer rank 1"], signal.SIGSTOP)

@@ -68,9 +68,8 @@ def write_dataset(
 
 def kind(feature: dict[str, Any]) -> Any:
     """The NumPy type of a feature's values."""
-    depth = (feature.get("info") or {}).get("is_depth_map")
     if feature["dtype"] in ("image", "video"):
-        return np.uint16 if depth else np.uint8
+        return np.uint16 if (feature.get("info") or {}).get("is_depth_map") else np.uint8
     return np.dtype(feature["dtype"])
 
 
