@@ -29,11 +29,7 @@ ACCOUNTS = {WRITER: ("alice", "write"), READER: ("alice", "read"), STRANGER: ("m
 
 @dataclass
 class Fault:
-    """Something that goes wrong with requests of a method whose path has `match` in it, so many `times`.
-
-    Either a `status` is answered, which `says` something; or `cut_after` bytes of the body are read, and the
-    connection is cut.
-    """
+    """Requests of a method whose path has `match` in it get a `status`, or are cut after some bytes."""
 
     method: str
     match: str

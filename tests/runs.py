@@ -9,9 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import pytest
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
@@ -82,7 +85,6 @@ def polls(engine: Engine) -> Iterator[Progress]:
 
 
 def collect(engine: Engine, group: str, count: int) -> list[EpisodeResult]:
-    """Polls until `group` has `count` results."""
     results: list[EpisodeResult] = []
     for progress in polls(engine):
         results += [e for e in progress.episodes if e.plan.group == group]
@@ -115,27 +117,19 @@ def local_engine(config: RunConfig, tasks: tuple[str, ...] = ("match",), state: 
 
 def trained(config: RunConfig) -> tuple[list[Progress], LocalEngine]:
     """A run in one process from beginning to end: everything that was reported, and its engine."""
-    engine = local_engine(config)
-    try:
+    with closing(local_engine(config)) as engine:
         engine.train()
         return drive(engine), engine
-    finally:
-        engine.close()
 
 
 def updates(history: Sequence[Progress]) -> list[dict[str, float]]:
-    """The metrics of all updates that were reported."""
     return [update for progress in history for update in progress.updates]
 
 
 def records(run: Path, kind: str = "") -> list[dict[str, Any]]:
     """The lines of a run's ``metrics.jsonl``, or those of a kind; all that JSON does not know is an error."""
-
-    def constant(name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
     lines = (run / METRICS).read_text().splitlines()
-    found = [json.loads(line, parse_constant=constant) for line in lines]
+    found = [json.loads(line, parse_constant=pytest.fail) for line in lines]
     return [record for record in found if not kind or record["kind"] == kind]
 
 

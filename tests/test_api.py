@@ -69,16 +69,12 @@ def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path, monkey
     assert chunk.shape[1] == 2 and np.isfinite(chunk).all()
     assert not np.array_equal(chunk, policy.act(observation)), "a flow policy samples"
     assert np.array_equal(chunk, load_policy(further.policy).act(observation))
-
-
-def test_a_run_is_resumed_by_its_own_function():
     with pytest.raises(InputError, match="resume=True: use accerl_lerobot.resume"):
         train(RunConfig(resume=True))
 
 
 @pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path):
-    """Its cells one after another, as Jupyter runs them, on a recipe that is cut short."""
     cells = json.loads((EXAMPLES / "improve_a_policy.ipynb").read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     script = tmp_path / "notebook.py"

@@ -28,8 +28,7 @@ def test_help_answers_without_torch_or_lerobot() -> None:
         "assert not {'torch', 'lerobot', 'ray', 'draccus', 'numpy'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for verb in cli.VERBS:
-        assert f"\n  {verb} " in done.stdout
+    assert all(f"\n  {verb} " in done.stdout for verb in cli.VERBS)
 
 
 def test_an_unknown_verb(capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,8 +109,6 @@ def test_a_reader_that_has_gone_ends_the_command_quietly() -> None:
 
 
 class TestTrain:
-    """`accerl train` around `run.train`."""
-
     @pytest.fixture
     def arguments(self, tmp_path: Path, tiny_checkpoint: Path) -> list[str]:
         places = [f"--policy.path={tiny_checkpoint}", f"--output_dir={tmp_path / 'run'}"]

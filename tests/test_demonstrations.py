@@ -29,7 +29,6 @@ from tests.runs import off_policy_run
 from tests.tiny_datasets import labels, record_dataset, write_dataset
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
-STATE_SIZE = 5  # of its ``observation.environment_state``
 K, COST = 4, 0.25
 
 
@@ -111,7 +110,7 @@ def test_of_a_long_dataset_only_a_part_is_read(dataset: DatasetConfig, like: Seg
 
 def test_the_memory_begins_with_them_and_is_restored_without(dataset, like: Segment, tiny_checkpoint: Path):
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-    adapter = with_teacher(load_adapter, SimulatorStateConfig(), STATE_SIZE, policy)
+    adapter = with_teacher(load_adapter, SimulatorStateConfig(), 5, policy)  # numbers of its state
     adapter.demonstrations = partial(demonstrations, dataset, COST)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)

@@ -14,20 +14,13 @@ from accerl_lerobot.cli.doctor import FAIL, OK, WARN, Check
 from accerl_lerobot.engines.config import RunConfig, decode
 
 
-@pytest.fixture
-def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine on which all is well, whatever this one is like."""
-    monkeypatch.setattr(doctor, "machine", lambda joins: [Check("python", OK, "3.12")])
-    monkeypatch.setattr(doctor, "rendering", lambda needed: Check("rendering", OK, "drawn"))
-
-
 def test_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
     """The tests need a machine on which everything works, so the doctor must find none of it missing."""
     assert cli.main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert "FAIL" not in out and "MuJoCo draws 64 × 64 pixels" in out
-    for name in ("python", "lerobot", "ray", "torch", "rendering", "cpu", "memory", "disk"):
-        assert f" {name} " in out
+    names = ("python", "lerobot", "ray", "torch", "rendering", "cpu", "memory", "disk")
+    assert all(f" {name} " in out for name in names)
     assert "recipe" not in out and out.endswith("all good\n")
 
 
@@ -40,7 +33,9 @@ def test_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
         (["imagination", "--imagination.path=nowhere"], ["imagination.path='nowhere': config.json: is"]),
     ],
 )
-def test_what_a_run_would_do(arguments: list[str], lines: list[str], healthy: None, capsys) -> None:
+def test_what_a_run_would_do(arguments: list[str], lines: list[str], monkeypatch, capsys) -> None:
+    monkeypatch.setattr(doctor, "machine", lambda joins: [Check("python", OK, "3.12")])
+    monkeypatch.setattr(doctor, "rendering", lambda needed: Check("rendering", OK, "drawn"))
     fails = "lr" not in arguments[1]
     assert cli.main(["doctor", f"--config_path={arguments[0]}", arguments[1]]) == fails
     out = capsys.readouterr().out
@@ -64,8 +59,6 @@ def test_every_way_of_not_drawing_is_an_answer(script: str, text: str, monkeypat
 
 
 class TestResources:
-    """Cores, GPU memory and pace against a recipe."""
-
     @pytest.mark.parametrize(
         ("sections", "words"),
         [

@@ -190,8 +190,7 @@ print(environment.reset(0, "reach")["observation.state"].shape)
 
 @pytest.mark.slow
 def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_path: Path):
-    """Policy, algorithm and environment by their names in a run on Ray; policy and environment as LeRobot's
-    plugins, which only pip has announced."""
+    """By their names in a run on Ray; policy and environment as LeRobot's plugins, too."""
     copies = tmp_path / "sources"  # pip builds there
     sources = [shutil.copytree(path, copies / path.name) for path in (SOURCE, REACH)]
     environment = pip_installed(tmp_path / "site", *sources)

@@ -77,7 +77,6 @@ def play(environment: Environment, seconds: int) -> bool:
 
 
 def test_simulators_end_at_once_when_their_parent_is_interrupted():
-    """They leave the signal to it."""
     before = set(multiprocessing.active_children())
     with pytest.raises(KeyboardInterrupt), simulated(SimulatedConfig(), play, [0, 3600]) as results:
         assert next(results) and set(multiprocessing.active_children()) - before

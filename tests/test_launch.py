@@ -28,8 +28,6 @@ DURING = 8
 
 @dataclass
 class Story:
-    """What a run has reported."""
-
     config: RunConfig
     before: list[EpisodeResult]
     history: list[Progress]
@@ -87,7 +85,7 @@ def test_at_learning_rate_zero_every_ratio_is_one_and_all_updates_are_made_once(
     assert all(u["ess"] > 0.9999 and u["clip_fraction"] == 0 and u["skipped"] == 0 for u in story.updates)
 
 
-def test_samples_lag_behind_and_the_lag_is_bounded(story: Story):
+def test_the_lag_is_bounded_and_the_books_of_replay_balance(story: Story):
     config = story.config
     under_way = config.rollout.workers * config.rollout.environments * config.rollout.segment_length
     bound = lag_bound(
@@ -96,9 +94,6 @@ def test_samples_lag_behind_and_the_lag_is_bounded(story: Story):
     )  # fmt: skip
     assert 0 < max(u["lag_max"] for u in story.updates) <= bound
     assert all(0 <= u["lag_mean"] <= u["lag_max"] for u in story.updates)
-
-
-def test_the_books_of_replay_balance(story: Story):
     books = story.history[-1].replay
     for unit in ("segments", "decisions"):
         assert books[f"inserted_{unit}"] == books[f"stored_{unit}"] + books[f"removed_{unit}"]

@@ -44,7 +44,6 @@ def two_nodes() -> Iterator[tuple[Cluster, Any]]:
 
 
 def engine(address: str, nodes: str, updates: int, max_restarts: int = 0) -> RayEngine:
-    """A run with its rollout workers on these nodes."""
     launch = {"address": address, "placement": {"rollout": nodes}, "max_restarts": max_restarts}
     config = tiny_run(
         Path("nowhere"),
@@ -57,13 +56,11 @@ def engine(address: str, nodes: str, updates: int, max_restarts: int = 0) -> Ray
 
 
 def workers_of(node: Any, pids: dict[str, int]) -> set[str]:
-    """Names of the workers that run on a node."""
     raylet = node.all_processes["raylet"][0].process.pid
     return {name for name, pid in pids.items() if psutil.Process(pid).ppid() == raylet}
 
 
 def a_run_over_two_nodes_ends_right(made: Cluster, second: Any) -> None:
-    """Each worker is where it was sent, and of the run nothing is left but the cluster."""
     one = engine(made.address, "sim", updates=12)
     pids = one.pids()
     first = {"inference", "replay", "trainer"}
@@ -81,7 +78,6 @@ def a_run_over_two_nodes_ends_right(made: Cluster, second: Any) -> None:
 
 
 def a_node_that_leaves_takes_nothing_along(made: Cluster, second: Any) -> None:
-    """Ray starts its rollout workers again on the first one."""
     one = engine(made.address, "all", updates=1_000_000, max_restarts=3)
     pids = one.pids()
     there = workers_of(second, pids)
@@ -108,7 +104,6 @@ def a_node_that_leaves_takes_nothing_along(made: Cluster, second: Any) -> None:
 
 
 def main() -> None:
-    """All of it; an assertion ends the process, and its traceback says which."""
     with (
         patch("accerl_lerobot.engines.ray_engine.POLL_S", 0.1),
         patch("accerl_lerobot.inference.worker.InferenceWorker", LightInference),

@@ -45,8 +45,7 @@ def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoi
     assert [u["grad_norm"] > 0 for u in updates] == [False] + [True] * (len(updates) - 1)
     assert max(probes) <= 1e-4, "decisions were made by whole weights that had been in parts"
 
-    before = load_file(tiny_checkpoint / "model.safetensors")
-    after = load_file(tmp_path / PRETRAINED / "model.safetensors")
+    before, after = (load_file(p / "model.safetensors") for p in (tiny_checkpoint, tmp_path / PRETRAINED))
     assert {k: t.shape for k, t in after.items()} == {k: t.shape for k, t in before.items()}
     assert any(not torch.equal(after[k], before[k]) for k in before)
     trained = snapshot.load(tmp_path / TRAINING_STATE / WEIGHTS)

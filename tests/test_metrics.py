@@ -5,8 +5,7 @@ import re
 import sys
 from contextlib import closing
 from pathlib import Path
-from types import SimpleNamespace
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -73,9 +72,9 @@ def test_wandb_only_when_enabled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_tracker_that_fails_ends_nothing(tmp_path: Path, monkeypatch, caplog) -> None:
-    fails = MagicMock(side_effect=ConnectionError("the server is away"))
-    client = SimpleNamespace(init=lambda **_: SimpleNamespace(log=fails, finish=fails))
-    monkeypatch.setitem(sys.modules, "wandb", client)
+    fails = Mock(side_effect=ConnectionError("the server is away"))
+    run = Mock(log=fails, finish=fails)
+    monkeypatch.setitem(sys.modules, "wandb", Mock(**{"init.return_value": run}))
     log = MetricsLog(tmp_path, WandBConfig(enable=True), {})
     log.write("train", 1, {"loss": 1.0})
     log.write("train", 2, {"loss": 0.5})
@@ -117,17 +116,14 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: py
     assert explained("train") == (told - {"update"}) | with_ray | of_tdmpc
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
     served = Batcher(1, 0.0).counts | {"busy_share": 0.0, "version": 0.0}
+    rollout |= {"restarts", "success_exploring", "inference_restarts"}
     rollout |= {f"inference_{k}" for k in merge_metrics([served])}
-    rollout |= {"restarts", "inference_restarts", "success_exploring"}
     assert explained("rollout") == rollout | {f"episode_{name}" for name in ("return", "steps", "decisions")}
 
 
-def test_every_role_and_state_of_the_timeline_is_explained() -> None:
+def test_the_timeline_and_the_summary_are_explained() -> None:
     text = (ROOT / "docs" / "metrics.md").read_text().split("## Timeline")[1].split("\n## ")[0]
     assert set(re.findall(r"`([a-z_]+(?: model|-model learning)?)`", text)) == {*ROLES, *STATES}
-
-
-def test_the_summary_is_explained() -> None:
     logged = set(Loop._summary(MagicMock(lags=[]), MagicMock(), MagicMock()))
     whens = {f"{name}_{when}" for name in ("success", "n", "ci95", "tasks") for when in ("before", "after")}
     text = (ROOT / "docs" / "metrics.md").read_text().split("## `summary.json`")[1]

@@ -18,6 +18,7 @@ from tests.runs import records, replacing
 from tests.tiny_datasets import FRONT, IMAGE, labels, record_dataset, write_dataset
 
 ENV = SimulatedConfig(max_steps=16)
+CRITIC = "--algorithm.type=chunk_critic"
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +60,7 @@ def test_the_checkpoint_does_more_of_what_succeeded(algorithm, tiny_checkpoint, 
     ("wrong", "message"),
     [
         (["--algorithm.type=gipo"], "algorithm.type='gipo': .*use awr, self_imitation or chunk_critic"),
-        (
-            ["--algorithm.type=chunk_critic", "--world_model.type=simulator"],
-            "world_model.type='simulator': the dataset has no observation.environment_state; use latent",
-        ),
+        ([CRITIC, "--world_model.type=simulator"], "no observation.environment_state; use latent"),
         (["--policy.path=null"], "policy.path=None: give a LeRobot checkpoint"),
     ],
 )
@@ -88,17 +86,14 @@ def test_graded_rewards_without_a_success_are_enough_for_awr(tiny_checkpoint, tm
 
 
 @pytest.mark.parametrize("model", ["simulator", "latent"])
-def test_the_chunk_critic_learns_from_episodes(
-    model, tiny_checkpoint, recorded, tmp_path, capsys, monkeypatch
-):
+def test_the_chunk_critic_learns(model, tiny_checkpoint, recorded, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(LatentModel, "first_steps", 10)
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 50)
     if model == "simulator":
         recorded = tmp_path / "recorded"
         record_dataset(recorded, replace(ENV, environment_state=True), episodes=8, failure_share=0.25)
     out = tmp_path / "out"
-    given = arguments(tiny_checkpoint, recorded, out)
-    run = replacing(given, "--trainer.updates=15", "--algorithm.type=chunk_critic")
+    run = replacing(arguments(tiny_checkpoint, recorded, out), "--trainer.updates=15", CRITIC)
     if model == "latent":
         assert main(run) == 2
         why = "are followed by another one in their episode, and the world model learns from 100 or more"

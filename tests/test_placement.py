@@ -14,10 +14,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.run.train import Run
 from tests.runs import changed, tiny_run
 
-Nodes = list[dict[str, float]]
 
-
-def cluster(*gpus: float, sim: int | None = None) -> Nodes:
+def cluster(*gpus: float, sim: int | None = None) -> list[dict[str, float]]:
     """Resources of nodes with so many GPUs, of which the one numbered `sim` has a resource of that name."""
     nodes = [{"CPU": 8.0, "GPU": count, f"node:10.0.0.{i + 1}": 1.0} for i, count in enumerate(gpus)]
     if sim is not None:
@@ -26,7 +24,6 @@ def cluster(*gpus: float, sim: int | None = None) -> Nodes:
 
 
 def run(device: str = "auto", **placement: str) -> RunConfig:
-    """A run with its roles placed so."""
     launch = {"address": "auto", "placement": placement}
     return tiny_run(Path("nowhere"), policy={"device": device}, launch=launch)
 
@@ -91,7 +88,6 @@ def test_a_cluster_that_is_none_is_refused_when_the_recipe_is_read(fields: dict[
 
 
 def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Not even with what comes before its workers."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     config = tiny_run(Path("nowhere"), trainer={"ranks": 2}, policy={"device": "auto"})
     with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):

@@ -28,7 +28,6 @@ from tests.tiny_datasets import FRONT, IMAGE, STATE, write_dataset
 
 ROOT = Path(__file__).parents[1]
 TINY = ["--dataset.repo_id=accerl/metaworld_tiny", f"--dataset.root={ROOT / 'datasets' / 'metaworld_tiny'}"]
-TINY_ENV = ["--env.type=metaworld", "--env.task=drawer-open-v3"]
 ACT = "--sft.policy={type: act, chunk_size: 4, n_action_steps: 4, pretrained_backbone_weights: null}"
 SIMULATED = ["--env.type=simulated"]
 SPEC = make_environment(SimulatedConfig()).spec
@@ -85,37 +84,27 @@ def test_a_policy_that_pads_takes_the_states_and_cameras_that_it_is_fine_tuned_o
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """The one line that a command writes before it ends with code 2."""
-    capsys.readouterr()
     assert cli.main(list(arguments)) == 2
     out, err = capsys.readouterr()
-    lines = [line for line in err.splitlines() if line.startswith("accerl: ")]
-    assert not out and len(lines) == 1 and "Traceback" not in err and lines[0] == err.splitlines()[-1], err
-    return lines[0]
+    *_, line = err.splitlines()
+    assert not out and err.count("accerl: ") == 1 and "Traceback" not in err and line.startswith("accerl: ")
+    return line
 
 
 @pytest.mark.parametrize("verb", ["train", "eval"])
 def test_checkpoints_of_another_image_size(verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A policy that does not resize: LeRobot takes any image, and nobody can tell what it does then."""
     path, out = write_act(tmp_path / "policy", image=48), tmp_path / "out"
     told = [*SIMULATED, f"--policy.path={path}", "--launch.engine=local", f"--output_dir={out}"]
     line = refused(capsys, verb, *told)
     assert f"its {FRONT} is (3, 48, 48), but (3, 32, 32) in" in line and not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        ([*SIMULATED, *TINY], "no observation.images.corner2 in the environment, which offers " + FRONT),
-        ([*TINY, *TINY_ENV[:1], "--env.task=push-v3"], "'accerl/metaworld_tiny': no episode of"),
-        ([*TINY, *TINY_ENV, "--env.image_size=128"], "is (3, 64, 64), but (3, 128, 128) in the environment"),
-    ],
-)
-def test_a_dataset_of_another_environment(arguments: list[str], line: str, tmp_path: Path, capsys):
-    pytest.importorskip("metaworld")
+@pytest.mark.parametrize("verb", ["train", "sft"])
+def test_a_dataset_of_another_environment(verb: str, tmp_path: Path, capsys):
     out = tmp_path / "out"
-    for verb in ("train", "sft"):
-        first = [verb, "--sft.steps=1", ACT, f"--output_dir={out}"]
-        assert line in refused(capsys, *first, *arguments) and not out.exists()
+    line = refused(capsys, verb, "--sft.steps=1", ACT, f"--output_dir={out}", *SIMULATED, *TINY)
+    assert "no observation.images.corner2 in the environment, which offers " + FRONT in line
+    assert not out.exists()
 
 
 QUICK = ["train", str(ROOT / "recipes" / "quickstart.yaml")]

@@ -21,13 +21,13 @@ from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 
 TOKEN = "RAY_AUTH_TOKEN"
-VARIABLES = ("RAY_AUTH_MODE", TOKEN, "RAY_AUTH_TOKEN_PATH", "RAY_TMPDIR")
 
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """An environment in which nothing is set and Ray has not been imported."""
-    for name in (*ray_session.WORKERS, *ray_session.PRIVATE, *VARIABLES):
+    own = ("RAY_AUTH_MODE", TOKEN, "RAY_AUTH_TOKEN_PATH", "RAY_TMPDIR")
+    for name in (*ray_session.WORKERS, *ray_session.PRIVATE, *own):
         monkeypatch.setenv(name, "")  # so that it is put back afterwards
         monkeypatch.delenv(name)
     monkeypatch.delitem(sys.modules, "ray", raising=False)
@@ -84,7 +84,6 @@ def of_own_processes(ask: Callable[[psutil.Process], Any]) -> list[Any]:
 
 
 def listening() -> list[str]:
-    """Addresses at which own processes accept TCP connections."""
     sockets = itertools.chain(*of_own_processes(lambda process: process.net_connections("tcp")))
     return [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
 
@@ -112,20 +111,13 @@ def test_a_client_without_the_token_is_refused_and_the_token_is_in_no_log(light_
     assert len(texts) > 9 and not any(os.environ[TOKEN] in text for text in texts)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_processes_that_run_environments_do_not_get_the_hubs_token(light_engine: Callable[..., Any]):
-    pids = light_engine().pids()
-    given = Path(f"/proc/{pids['rollout 0']}/environ").read_text().split("\0")
-    environment = dict(entry.split("=", 1) for entry in given if "=" in entry)
+def test_processes_that_run_environments_do_not_get_the_hubs_token(light_engine, tmp_path: Path):
+    given = psutil.Process(light_engine().pids()["rollout 0"]).environ()
     hidden = ray_session.NO_HUB_TOKEN["runtime_env"]["env_vars"]
-    assert {name: environment[name] for name in hidden} == hidden
-
-
-def test_a_client_in_such_a_process_finds_no_token(tmp_path: Path):
+    assert given.items() >= hidden.items()
     (tmp_path / "token").write_text("hf_storedstoredstored")
     command = [sys.executable, "-c", "import huggingface_hub; print(huggingface_hub.get_token())"]
     clean = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | {"HF_HOME": str(tmp_path)}
-    hidden = ray_session.NO_HUB_TOKEN["runtime_env"]["env_vars"]
     for environment, token in ((clean, "hf_storedstoredstored\n"), (clean | hidden, "None\n")):
         assert subprocess.check_output(command, env=environment, text=True) == token
 

@@ -54,8 +54,6 @@ class Arm(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
 @pytest.fixture
 def registered() -> Iterator[Callable[[type[Arm]], GymConfig]]:
-    """Registers an environment for one test."""
-
     def register(kind: type[Arm]) -> GymConfig:
         gymnasium.register("reported/Arm-v0", kind, disable_env_checker=True)
         return GymConfig(id="reported/Arm-v0", images={"front": "pixels"}, state=("joints",), task="Reach")

@@ -27,8 +27,7 @@ from benchmarks.__main__ import CONFIGS as BENCHMARKS
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "accerl_lerobot"
 
-HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
-LONGEST_FILE = 600
+HEADER, LONGEST_FILE = "# SPDX-License-Identifier: Apache-2.0\n", 600
 MOST_EXPRESSIONS, MOST_FILES = 62_700, 114
 SHELLS = {
     "ray_engine.py", "ray_session.py", "supervision.py", "doctor.py", "worker.py", "online.py", "transport"
@@ -61,7 +60,6 @@ def sources() -> list[Path]:
 
 @cache
 def parsed(path: Path) -> tuple[ast.Module, list[ast.AST]]:
-    """The syntax tree of a file, and all of its nodes."""
     tree = ast.parse(path.read_text())
     return tree, list(ast.walk(tree))
 
@@ -77,17 +75,13 @@ def imports(path: Path, *, top_level: bool = False) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def test_every_python_file_has_the_licence_header() -> None:
+def test_every_file_has_the_licence_header_and_none_is_too_long() -> None:
     bare = [p.name for p in tracked() if p.suffix == ".py" and not p.read_text().startswith(HEADER)]
     assert bare == []
-
-
-def test_no_file_is_too_long() -> None:
     assert [p.name for p in sources() if len(p.read_text().splitlines()) > LONGEST_FILE] == []
 
 
 def test_packages_form_layers() -> None:
-    """No package, and no module beside them, needs itself by way of others."""
     needs: dict[str, set[str]] = {}
     for path in sources():
         unit = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
@@ -103,18 +97,16 @@ def test_packages_form_layers() -> None:
 
 def test_the_package_does_not_grow() -> None:
     """Lower these bounds whenever the package allows it."""
-    kinds = (
-        ast.Name, ast.Attribute, ast.Call, ast.BinOp, ast.BoolOp, ast.UnaryOp, ast.Compare, ast.Subscript,
-    )  # fmt: skip
+    operations = (ast.BinOp, ast.BoolOp, ast.UnaryOp, ast.Compare)
+    kinds = (ast.Name, ast.Attribute, ast.Call, ast.Subscript, *operations)
     found = sum(isinstance(node, kinds) for path in sources() for node in parsed(path)[1])
     assert found <= MOST_EXPRESSIONS
     assert len(sources()) <= MOST_FILES
 
 
 def test_nothing_shadows_hugging_face_datasets_or_the_standard_library() -> None:
-    for path in tracked():
-        assert path.name != "datasets.py"
-        assert not (path.parent.name == "datasets" and path.suffix == ".py")
+    python = [path for path in tracked() if path.suffix == ".py"]
+    assert not [path for path in python if "datasets" in (path.stem, path.parent.name)]
     names = {p.stem for p in sources()} | {p.name for p in PACKAGE.iterdir() if p.is_dir()}
     assert names & set(sys.stdlib_module_names) <= {"__init__", "__main__"}
 
@@ -186,7 +178,6 @@ def requirements() -> list[Requirement]:
 
 
 def test_no_paths_of_a_machine() -> None:
-    """A path into somebody's home or an internal host works nowhere else."""
     pattern = re.compile(rb"/(root|home|work|usr/local|opt)/")
     files = [path for path in tracked() if path.suffix not in (".png", ".mp4", ".parquet")]
     assert [path.name for path in files if pattern.search(path.read_bytes())] == []

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from accerl_lerobot.run import preflight, resuming
 from accerl_lerobot.run.resuming import resume_command
 from accerl_lerobot.run.train import Run
 from tests.policies.checkpoints import write_smolvla
-from tests.runs import changed, tiny_run
+from tests.runs import changed, eventually, tiny_run
 from tests.runs import records as logged
 from tests.test_run import local_run
 from tests.tiny_datasets import one_process
@@ -55,7 +54,6 @@ def summary(run: Path) -> dict[str, Any]:
 
 
 def files(run: Path) -> list[bytes]:
-    """Weights and journal."""
     last = run / "checkpoints" / "last" / "pretrained_model"
     paths = [last / "model.safetensors", last / "value_head.safetensors", run / "episodes.jsonl"]
     return [path.read_bytes() for path in paths]
@@ -63,7 +61,6 @@ def files(run: Path) -> list[bytes]:
 
 @pytest.fixture(scope="module")
 def whole(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that was never stopped."""
     folder = tmp_path_factory.mktemp("whole")
     assert train(folder / "run", tiny_checkpoint) == 0
     return folder / "run"
@@ -236,7 +233,6 @@ def test_a_damaged_or_hostile_run_is_refused_before_anything_is_written(
 
 @pytest.mark.slow
 def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint: Path, tmp_path: Path):
-    """All of it real, in processes of their own, of which the first gets SIGKILL and the second SIGTERM."""
     run, path, log = tmp_path / "run", tmp_path / "recipe.yaml", tmp_path / "log"
     config = tiny_run(
         tiny_checkpoint,
@@ -253,10 +249,8 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
         """Starts it, waits for a checkpoint of so many updates, and sends a signal; its exit code."""
         with log.open("wb") as out:
             process = subprocess.Popen(arguments, stdout=out, stderr=out)
-            deadline = time.monotonic() + 240
-            while not any(int(p.name) >= least for p in (run / "checkpoints").glob("0*")):
-                assert process.poll() is None and time.monotonic() < deadline, log.read_text()
-                time.sleep(0.02)
+            saved = (run / "checkpoints").glob
+            assert eventually(lambda: any(int(p.name) >= least for p in saved("0*")), 240), log.read_text()
             process.send_signal(number)
             return process.wait(60)
 

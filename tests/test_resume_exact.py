@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine in one process; a run that was left is the run that was never left, to the last bit."""
 
-import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +26,9 @@ def config_of(checkpoint: Path, case: str) -> RunConfig:
     learn = {"lr": 1e-3, "advantage_memory": 0.5}
     if "critic" in case:
         return off_policy_run(checkpoint, seed=3, trainer=learn | {"value_warmup_updates": 9})
-    config = tiny_run(checkpoint, seed=3, trainer=learn)
-    if "tasks" not in case:
-        return config
-    env, ppo = {"task": "match,mirror"}, PPOConfig(level="chunk", kl_coef=0.1)
-    return changed(config, env=env, rollout={"episodes": 30}, trainer={"probe_every": 4}, algorithm=ppo)
+    config = tiny_run(checkpoint, seed=3, trainer=learn | {"probe_every": 4})
+    ppo: Any = {"algorithm": PPOConfig(level="chunk", kl_coef=0.1), "rollout": {"episodes": 30}}
+    return changed(config, env={"task": "match,mirror"}, **ppo) if "tasks" in case else config
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -44,7 +41,6 @@ def few_first_steps() -> Iterator[None]:
 
 
 def begin(checkpoint: Path, case: str, state: Path | None = None) -> LocalEngine:
-    """An engine that trains, from the beginning or from `state`."""
     tasks = ("match", "mirror") if "tasks" in case else ("match",)
     engine = local_engine(config_of(checkpoint, case), tasks, state)
     if state is None:
@@ -53,51 +49,29 @@ def begin(checkpoint: Path, case: str, state: Path | None = None) -> LocalEngine
     return engine
 
 
-def weights(engine: LocalEngine) -> dict[str, np.ndarray]:
-    return {name: tensor.copy() for name, tensor in engine._adapter.export_trainable().items()}
-
-
 def told(history: list[Progress]) -> list[Any]:
     """All that a run says, and nothing of when it was asked."""
     episodes = [(e.plan, e.success, e.episode_return, e.versions) for p in history for e in p.episodes]
     return [updates(history), episodes, history[-1].rollout, history[-1].replay]
 
 
-Whole = Callable[[str], tuple[list[Any], dict[str, np.ndarray]]]
-
-
-@pytest.fixture(scope="module")
-def whole(tiny_checkpoint: Path) -> Whole:
-    """Words of a case's run that was never left, and the weights that it ends with."""
-
-    @functools.cache
-    def made(case: str) -> tuple[list[Any], dict[str, np.ndarray]]:
-        engine = begin(tiny_checkpoint, case)
-        said = told(drive(engine))
+@pytest.mark.parametrize("case", CASES)
+def test_a_run_that_was_left_twice_goes_on_as_if_it_had_not(case: str, tiny_checkpoint: Path, tmp_path: Path):
+    whole = begin(tiny_checkpoint, case)
+    begun = until(whole, 3)
+    whole.save(tmp_path / "3")  # which changes nothing
+    expected = told(begun + drive(whole))
+    engine, history = begin(tiny_checkpoint, case), []
+    for version in (1, 6):
+        history += until(engine, version)
+        saved = engine.save(tmp_path / str(version))
+        assert (saved.version, saved.updates) == (history[-1].version, [])
         engine.close()
-        return said, weights(engine)
-
-    return made
-
-
-@pytest.mark.parametrize(
-    ("case", "left_at"), [*((case, 6) for case in CASES), pytest.param(CASES[-1], 1, marks=pytest.mark.slow)]
-)
-def test_a_run_that_was_left_goes_on_as_if_it_had_not(case, left_at, whole, tiny_checkpoint, tmp_path):
-    expected, learnt = whole(case)
-    first = begin(tiny_checkpoint, case)
-    before = until(first, left_at)
-    saved = first.save(tmp_path)
-    assert (saved.version, saved.updates) == (before[-1].version, [])
-    if case == "ratio":
-        assert told(before + drive(first)) == expected, "saving changes nothing"
-    first.close()
-    again = begin(tiny_checkpoint, case, tmp_path / TRAINING_STATE)
-    after = drive(again)
-    assert told(before + after) == expected and len(after) > 1
-    for name, tensor in weights(again).items():
-        np.testing.assert_array_equal(tensor, learnt[name])
-    again.close()
+        engine = begin(tiny_checkpoint, case, tmp_path / str(version) / TRAINING_STATE)
+    after = drive(engine)
+    assert told(history + after) == expected and len(after) > 1
+    for name, tensor in engine._adapter.export_trainable().items():
+        np.testing.assert_array_equal(tensor, whole._adapter.export_trainable()[name])
     assert all(np.isfinite(value) for update in expected[0] for value in update.values())
     if "tasks" in case:
         probes = [u["logprob/mismatch_max"] for u in expected[0] if "logprob/mismatch_max" in u]

@@ -18,8 +18,6 @@ from accerl_lerobot.errors import warn_once
 from accerl_lerobot.run import train as run
 from tests.runs import changed, records, tiny_run
 
-Finished = tuple[Path, dict[str, Any]]  # its folder and its summary
-
 
 def local_run(checkpoint: Path, output_dir: Path, **sections: Any) -> RunConfig:
     config = tiny_run(
@@ -33,18 +31,19 @@ def local_run(checkpoint: Path, output_dir: Path, **sections: Any) -> RunConfig:
     return changed(config, **sections)
 
 
-def executed(config: RunConfig) -> Finished:
+def executed(config: RunConfig) -> tuple[Path, dict[str, Any]]:
+    """A run that has been done: its folder and its summary."""
     directory = Path(config.output_dir or "")
     directory.mkdir(exist_ok=True)
     return directory, run.Run(config, directory, Console()).execute()
 
 
 @pytest.fixture(scope="module")
-def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     return executed(local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run"))
 
 
-def test_the_summary_has_what_is_promised(finished: Finished):
+def test_the_summary_has_what_is_promised(finished):
     directory, summary = finished
     assert summary == json.loads((directory / "summary.json").read_text())
     assert {path.name for path in directory.iterdir()} == {
@@ -86,7 +85,9 @@ def test_a_run_without_updates_measures_its_start(tiny_checkpoint: Path, tmp_pat
     assert "exploring episodes has succeeded" not in caplog.text
 
 
-def test_every_update_is_logged_once_and_episodes_are_averaged_as_they_end(finished: Finished):
+def test_every_update_is_logged_once_and_episodes_are_averaged_as_they_end(
+    finished: tuple[Path, dict[str, Any]],
+):
     directory, summary = finished
     train = records(directory, "train")
     assert [r["update"] for r in train] == list(range(1, 13))
@@ -95,7 +96,7 @@ def test_every_update_is_logged_once_and_episodes_are_averaged_as_they_end(finis
     assert ended and all(0 < r["episode_decisions"] <= r["episode_steps"] <= 12 for r in ended)
 
 
-def test_evaluations_are_logged_in_order_with_the_weights_they_used(finished: Finished):
+def test_evaluations_are_logged_in_order_with_the_weights_they_used(finished):
     found = records(finished[0], "evaluation")
     # Three were planned while training, after 4 and 8 updates; the one after 12 is the one after training.
     assert [r["group"] for r in found] == ["before", "during-1", "during-2", "after"]
@@ -140,7 +141,6 @@ def losing(lost_at: list[int]) -> Any:
 
 
 def closings() -> Any:
-    """Notes which engines are closed."""
     return patch.object(LocalEngine, "close", autospec=True, side_effect=LocalEngine.close)
 
 

@@ -18,6 +18,7 @@ from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
 from tests.runs import changed, drive, tiny_run, updates
 
+TWO = {"workers": 2}
 SIZES = ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=16, samples_per_insert=1.0)
 
 
@@ -87,11 +88,8 @@ def test_a_run_in_turn(light_ray: None, schedule: Any):
 @pytest.mark.parametrize(
     ("message", "sections"),
     [
-        (r"inference\.workers=2.*rollout\.workers, 1", {"inference": {"workers": 2}}),
-        (
-            r"inference\.workers=2.*local",
-            {"inference": {"workers": 2}, "rollout": {"workers": 2}, "launch": {"engine": "local"}},
-        ),
+        (r"inference\.workers=2.*rollout\.workers, 1", {"inference": TWO}),
+        (r"inference\.workers=2.*local", {"inference": TWO, "rollout": TWO, "launch": {"engine": "local"}}),
         (r"launch\.schedule.*episodes", {"launch": {"schedule": SYNCHRONOUS}, "rollout": {"episodes": 8}}),
         (
             r"launch\.schedule.*imagination",
