@@ -89,47 +89,46 @@ class TestOverrides:
             assert parse(RunConfig, [written(tmp_path, encode(config))]) == config
 
 
-MISTAKES: list[tuple[list[str], str]] = [
-    ([], "policy.path=None: give a LeRobot checkpoint"),
-    (["--help=trainr"], "--help='trainr': use all or one of env, dataset"),
-    (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr?"),
-    (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project"),
-    (["--trainer.lr=many"], "trainer.lr='many': use a number"),
-    (["--trainer.updates"], "trainer.updates='': give it a value: --trainer.updates=…"),
-    (["--trainer=3"], "trainer=3: a config section; use --trainer.field=value"),
-    (["--env.task=[a]"], "env.task=['a']: use text"),
-    (["--algorithm.type=ppo", "--algorithm.sigma=1"], "algorithm.sigma=1: no such field"),
-    (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
-    (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
-    (["--replay.max_unlearned_decisions=3"], "replay.max_unlearned_decisions=3: use at least one batch, 128"),
-    (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
-    (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
-    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates, or sft.steps"),
-    (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': cannot be imported"),
-    (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
-    (["here.yaml", "--config_path=there.yaml"], "config_path='here.yaml': it is set to 'there.yaml' already"),
-    (["seed=2"], "config_path='seed=2': no such file; this package has act_pusht, "),
-    (["--seed=1", "--seed.x=2"], "seed.x=2: seed is set to 1 already"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), MISTAKES)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "policy.path=None: give a LeRobot checkpoint"),
+        (["--help=trainr"], "--help='trainr': use all or one of env, dataset"),
+        (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr?"),
+        (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project"),
+        (["--trainer.lr=many"], "trainer.lr='many': use a number"),
+        (["--trainer.updates"], "trainer.updates='': give it a value: --trainer.updates=…"),
+        (["--trainer=3"], "trainer=3: a config section; use --trainer.field=value"),
+        (["--env.task=[a]"], "env.task=['a']: use text"),
+        (["--algorithm.type=ppo", "--algorithm.sigma=1"], "algorithm.sigma=1: no such field"),
+        (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
+        (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
+        (["--replay.max_unlearned_decisions=3"], "replay.max_unlearned_decisions=3: use at least one"),
+        (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve"),
+        (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
+        (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates, or sft.steps"),
+        (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': cannot be imported"),
+        (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
+        (["here.yaml", "--config_path=there.yaml"], "config_path='here.yaml': it is set to 'there"),
+        (["seed=2"], "config_path='seed=2': no such file; this package has act_pusht, "),
+        (["--seed=1", "--seed.x=2"], "seed.x=2: seed is set to 1 already"),
+    ],
+)
 def test_mistakes(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", *arguments]) == 2
     out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1
-    assert err.startswith(f"accerl: {message}")
+    assert out == "" and err.count("\n") == 1 and err.startswith(f"accerl: {message}")
 
 
-FILES: list[tuple[str, str]] = [
-    ("env: {type: metaworld\n", "not good YAML: while parsing a flow mapping"),
-    ("trainer: {lr: 1}\nseed: 1\ntrainer: {lr: 2}\n", "not good YAML: trainer is given twice in "),
-    ("- 1\n- 2\n", "a recipe is a mapping"),
-    ("a: !!python/object:os.system {}\n", "not good YAML: could not determine a constructor"),
-]
-
-
-@pytest.mark.parametrize(("text", "message"), FILES, ids=range(len(FILES)))
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("env: {type: metaworld\n", "not good YAML: while parsing a flow mapping"),
+        ("trainer: {lr: 1}\nseed: 1\ntrainer: {lr: 2}\n", "not good YAML: trainer is given twice in "),
+        ("- 1\n- 2\n", "a recipe is a mapping"),
+        ("a: !!python/object:os.system {}\n", "not good YAML: could not determine a constructor"),
+    ],
+)
 def test_bad_files(text: str, message: str, tmp_path: Path) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError, match=f"^config_path={path!r}: {re.escape(message)}"):

@@ -65,19 +65,19 @@ def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
                 assert error.value.hint.startswith("use ")
 
 
-RULES = [
-    (BackboneConfig, {"patch": 24}, "sft.backbone.patch=24: use "),
-    (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
-    (PixelModelConfig, {"channels": ()}, "world_model.model.channels="),
-    (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
-    (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
-    (TimelineConfig, {"runs": ()}, "runs="),
-    (TrainerConfig, {"ranks": 9, "batch_decisions": 8}, "trainer.ranks=9: use at most trainer.batch_decis"),
-    (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),
-]
-
-
-@pytest.mark.parametrize(("cls", "values", "said"), RULES)
+@pytest.mark.parametrize(
+    ("cls", "values", "said"),
+    [
+        (BackboneConfig, {"patch": 24}, "sft.backbone.patch=24: use "),
+        (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
+        (PixelModelConfig, {"channels": ()}, "world_model.model.channels="),
+        (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
+        (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
+        (TimelineConfig, {"runs": ()}, "runs="),
+        (TrainerConfig, {"ranks": 9, "batch_decisions": 8}, "trainer.ranks=9: use at most trainer"),
+        (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),
+    ],
+)
 def test_values_that_do_not_go_together_name_their_field(cls: type[Any], values: dict[str, Any], said: str):
     with pytest.raises(InputError) as error:
         cls(**values)
