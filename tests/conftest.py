@@ -9,13 +9,11 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
-
-if TYPE_CHECKING:
-    from accerl_lerobot.engines.ray_engine import RayEngine
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -56,24 +54,19 @@ def light_ray() -> Iterator[None]:
 
 
 @pytest.fixture
-def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
+def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Any]]:
     """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
-    from accerl_lerobot.engines import ray_engine
-    from accerl_lerobot.inference import worker as inference
-    from accerl_lerobot.trainer import worker as trainer
+    from accerl_lerobot.engines.ray_engine import RayEngine
     from tests.light_workers import LightInference, LightTrainer
     from tests.runs import tiny_run
 
-    monkeypatch.setattr(ray_engine, "POLL_S", 0.05)
-    monkeypatch.setattr(inference, "InferenceWorker", LightInference)
-    monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
-    made: list[RayEngine] = []
+    monkeypatch.setattr("accerl_lerobot.engines.ray_engine.POLL_S", 0.05)
+    monkeypatch.setattr("accerl_lerobot.inference.worker.InferenceWorker", LightInference)
+    monkeypatch.setattr("accerl_lerobot.trainer.worker.TrainerWorker", LightTrainer)
+    with ExitStack() as made:
 
-    def make(state: Path | None = None, learns: bool = True, **sections: Any) -> RayEngine:
-        config = tiny_run(Path("nowhere"), **sections)
-        made.append(ray_engine.RayEngine(config, ("match",), state=state, learns=learns))
-        return made[-1]
+        def make(state: Path | None = None, learns: bool = True, **sections: Any) -> RayEngine:
+            config = tiny_run(Path("nowhere"), **sections)
+            return made.enter_context(closing(RayEngine(config, ("match",), state=state, learns=learns)))
 
-    yield make
-    for one in made:
-        one.close()
+        yield make

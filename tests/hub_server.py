@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Hub on 127.0.0.1: as much of its protocol as huggingface_hub 1.33 speaks when it pushes and pulls.
 
-It keeps what a real one keeps apart: blobs, which any upload may leave behind, and commits, which name blobs
-and appear whole or not at all. It breaks when it is told to:
-
-    server.faults.append(Fault("PUT", "/lfs/", cut_after=1000, times=6))
-
-Storage is by LFS, and not by Xet: clients are told to leave that out by HF_HUB_DISABLE_XET=1.
+Blobs, which any upload may leave behind, and commits, which name blobs and appear whole or not at all, are
+apart as in a real one. Storage is by LFS, and not by Xet. `HubServer.faults` says what breaks.
 """
 
 from __future__ import annotations
@@ -25,21 +21,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-LARGE = (".safetensors", ".parquet", ".mp4", ".png", ".bin")
-"""Suffixes of files that are stored as LFS objects, as the Hub's .gitattributes has it."""
+LARGE = (".safetensors", ".parquet", ".mp4", ".png", ".bin")  # stored as LFS objects
 WRITER, READER, STRANGER = "hf_writerwriterwriter", "hf_readerreaderreader", "hf_strangerstranger"
 NOBODY = "hf_nobodysnobodys"  # which the server does not know
 ACCOUNTS = {WRITER: ("alice", "write"), READER: ("alice", "read"), STRANGER: ("mallory", "write")}
-"""Token → whose it is, and its role."""
 
 
 @dataclass
 class Fault:
-    """Something that goes wrong with requests of a method whose path has `match` in it, so many `times`.
-
-    Either a `status` is answered, which `says` something; or `cut_after` bytes of the body are read, and the
-    connection is cut.
-    """
+    """Requests of a method whose path has `match` in it get a `status`, or are cut after some bytes."""
 
     method: str
     match: str
@@ -49,32 +39,26 @@ class Fault:
     times: int = 1
 
 
-@dataclass
-class File:
-    """One file of a commit."""
-
-    oid: str
-    """Git's identifier: sha1 of the blob, or of the pointer."""
-    size: int
-    sha256: str
-    lfs: bool
+Files = dict[str, bytes]
 
 
 @dataclass
 class Repo:
-    """Branches and tags point at commits, commits name files."""
+    """Branches and tags point at commits, commits hold files."""
 
     private: bool
-    commits: dict[str, dict[str, File]] = field(default_factory=dict)
+    commits: dict[str, Files] = field(default_factory=dict)
     branches: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
     messages: dict[str, str] = field(default_factory=dict)
 
-    def resolve(self, revision: str) -> str | None:
-        found = self.branches.get(revision) or self.tags.get(revision)
-        return found or (revision if revision in self.commits else None)
+    def resolve(self, revision: str) -> str:
+        commit = self.branches.get(revision) or self.tags.get(revision) or revision
+        if commit not in self.commits:
+            raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
+        return commit
 
-    def commit(self, branch: str, files: dict[str, File], message: str) -> str:
+    def commit(self, branch: str, files: Files, message: str) -> str:
         oid = hashlib.sha1(f"{len(self.commits)} {message} {time.monotonic_ns()}".encode()).hexdigest()
         self.commits[oid], self.messages[oid], self.branches[branch] = files, message, oid
         return oid
@@ -85,15 +69,11 @@ class RefusedError(Exception):
 
     def __init__(self, status: int, code: str = "", message: str = "no") -> None:
         super().__init__(message)
-        self.status, self.code, self.message = status, code, message
+        self.status, self.code = status, code
 
 
 class HubServer(ThreadingHTTPServer):
-    """The server; `url` is what clients take for the Hub.
-
-    Args:
-        folder: for blobs.
-    """
+    """The server; `url` is what clients take for the Hub, `folder` is for large files that are uploaded."""
 
     daemon_threads = True
 
@@ -102,10 +82,8 @@ class HubServer(ThreadingHTTPServer):
         self.blobs = folder
         self.repos: dict[tuple[str, str], Repo] = {}
         self.faults: list[Fault] = []
-        self.journal: list[tuple[str, str, int]] = []
-        """(method, path, status) of every request that was answered."""
-        self.uploaded: list[str] = []
-        """sha256 of every large file that came whole."""
+        self.journal: list[tuple[str, str, int]] = []  # method, path and status of every answer
+        self.uploaded: list[str] = []  # sha256 of every large file that came whole
         self.lock = threading.Lock()
 
     @property
@@ -115,23 +93,16 @@ class HubServer(ThreadingHTTPServer):
     def repo(self, repo_id: str, repo_type: str = "model") -> Repo:
         return self.repos[repo_type, repo_id]
 
-    def files(self, repo_id: str, repo_type: str = "model", revision: str = "main") -> dict[str, bytes]:
+    def files(self, repo_id: str, repo_type: str = "model", revision: str = "main") -> Files:
         """Names and contents of a commit."""
         repo = self.repo(repo_id, repo_type)
-        commit = repo.commits[str(repo.resolve(revision))]
-        return {name: (self.blobs / file.sha256).read_bytes() for name, file in commit.items()}
+        return dict(repo.commits[repo.resolve(revision)])
 
-    def keep(self, data: bytes) -> str:
-        digest = hashlib.sha256(data).hexdigest()
-        (self.blobs / digest).write_bytes(data)
-        return digest
-
-    def plant(self, repo_id: str, files: dict[str, bytes], repo_type: str = "model") -> str:
+    def plant(self, repo_id: str, files: Files, repo_type: str = "model") -> str:
         """Commits files without asking any client, under whatever names; returns the commit."""
         repo = self.repos.setdefault((repo_type, repo_id), Repo(private=False))
         there = repo.commits.get(repo.branches.get("main", ""), {})
-        added = {n: File(git_oid(d), len(d), self.keep(d), n.endswith(LARGE)) for n, d in files.items()}
-        return repo.commit("main", there | added, "planted")
+        return repo.commit("main", there | files, "planted")
 
     def fault(self, method: str, path: str) -> Fault | None:
         with self.lock:
@@ -165,7 +136,6 @@ class Handler(BaseHTTPRequestHandler):
         fault = self.server.fault(self.command, path)
         if fault is not None and fault.cut_after >= 0:
             self.rfile.read(fault.cut_after)
-            self._note(path, 0)
             self.close_connection = True
             self.connection.shutdown(2)
             return
@@ -175,11 +145,10 @@ class Handler(BaseHTTPRequestHandler):
                 raise RefusedError(fault.status, message=fault.says)
             self._route(path, body)
         except RefusedError as refused:
-            data = json.dumps({"error": refused.message}).encode()
-            headers = {"X-Error-Message": refused.message, "Content-Type": "application/json"}
-            self._send(
-                refused.status, data, headers | ({"X-Error-Code": refused.code} if refused.code else {})
-            )
+            headers = {"X-Error-Message": str(refused)}
+            if refused.code:
+                headers["X-Error-Code"] = refused.code
+            self._json({"error": str(refused)}, refused.status, headers)
 
     def _body(self) -> bytes:
         if self.headers.get("Transfer-Encoding") == "chunked":
@@ -191,22 +160,18 @@ class Handler(BaseHTTPRequestHandler):
             return b"".join(parts)
         return self.rfile.read(int(self.headers.get("Content-Length") or 0))
 
-    def _note(self, path: str, status: int) -> None:
-        with self.server.lock:
-            self.server.journal.append((self.command, path, status))
-
     def _send(self, status: int, data: bytes, headers: dict[str, str]) -> None:
-        self._note(unquote(urlsplit(self.path).path), status)
-        headers = {"Content-Length": str(len(data))} | headers
+        with self.server.lock:
+            self.server.journal.append((self.command, unquote(urlsplit(self.path).path), status))
         self.send_response(status)
-        for key, value in headers.items():
+        for key, value in ({"Content-Length": str(len(data))} | headers).items():
             self.send_header(key, value)
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(data)
 
-    def _json(self, value: Any, status: int = 200) -> None:
-        self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})
+    def _json(self, value: Any, status: int = 200, headers: dict[str, str] | None = None) -> None:
+        self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"} | (headers or {}))
 
     def _route(self, path: str, body: bytes) -> None:
         who = self._account()
@@ -214,7 +179,7 @@ class Handler(BaseHTTPRequestHandler):
             return self._receive(path.rsplit("/", 1)[1], body)
         if path == "/api/whoami-v2":
             return self._json({"name": who[0], "type": "user", "auth": {}} if who else None)
-        if path == "/api/validate-yaml":
+        if path == "/api/validate-yaml":  # of a card
             return self._json({"errors": [], "warnings": []})
         if path == "/api/repos/create":
             return self._create(json.loads(body), who)
@@ -243,11 +208,7 @@ class Handler(BaseHTTPRequestHandler):
         if repo is None or repo.private and not owner:
             raise RefusedError(404 if who else 401, "RepoNotFound", "Repository not found")
         if writing and not (owner and who is not None and who[1] == "write"):
-            raise (
-                RefusedError(403, message="you do not have the right to write here")
-                if who
-                else RefusedError(401)
-            )
+            raise RefusedError(403 if who else 401, message="you do not have the right to write here")
         return repo
 
     def _create(self, given: dict[str, Any], who: tuple[str, str] | None) -> None:
@@ -261,8 +222,7 @@ class Handler(BaseHTTPRequestHandler):
             return self._json({"error": "exists", "url": f"{self.server.url}/{key[1]}"}, 409)
         repo = self.server.repos[key] = Repo(private=given.get("visibility") == "private")
         attributes = b"*.safetensors filter=lfs diff=lfs merge=lfs -text\n"
-        file = File(git_oid(attributes), len(attributes), self.server.keep(attributes), lfs=False)
-        repo.commit("main", {".gitattributes": file}, "initial commit")
+        repo.commit("main", {".gitattributes": attributes}, "initial commit")
         self._json({"url": f"{self.server.url}/{key[1]}", "name": key[1]})
 
     def _api(self, repo: Repo, repo_id: str, verb: str | None, rest: str | None, body: bytes) -> None:
@@ -274,19 +234,13 @@ class Handler(BaseHTTPRequestHandler):
                 raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
             return self._json(repo.tags.pop(rest))
         commit = repo.resolve(rest or "main")
-        if commit is None:
-            raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
         files = repo.commits[commit]
         if verb in (None, "revision"):
-            siblings = [{"rfilename": name} for name in files]
-            return self._json(
-                {"id": repo_id, "sha": commit, "private": repo.private, "siblings": siblings, "tags": []}
-            )
-        if verb == "tree":
-            return self._json([_listed(name, file) for name, file in files.items()])
-        if verb == "paths-info":
-            wanted = json.loads(body)["paths"]
-            return self._json([_listed(name, file) for name, file in files.items() if name in wanted])
+            told = {"id": repo_id, "sha": commit, "private": repo.private, "tags": []}
+            return self._json(told | {"siblings": [{"rfilename": name} for name in files]})
+        if verb in ("tree", "paths-info"):
+            wanted = json.loads(body)["paths"] if body else files
+            return self._json([_listed(name, files[name]) for name in files if name in wanted])
         if verb == "tag":
             repo.tags[json.loads(body)["tag"]] = commit
             return self._json({})
@@ -306,85 +260,67 @@ class Handler(BaseHTTPRequestHandler):
             for line in lines[1:]:
                 value = line["value"]
                 if line["key"] == "file":
-                    data = base64.b64decode(value["content"])
-                    files[value["path"]] = File(git_oid(data), len(data), self.server.keep(data), lfs=False)
+                    files[value["path"]] = base64.b64decode(value["content"])
                 elif line["key"] == "lfsFile":
-                    if not (self.server.blobs / value["oid"]).is_file():
-                        raise RefusedError(400, message=f"{value['path']} names an object that is not here")
-                    files[value["path"]] = File(value["oid"][:40], value["size"], value["oid"], lfs=True)
-                elif line["key"] == "deletedFile":
-                    del files[value["path"]]
+                    files[value["path"]] = (self.server.blobs / value["oid"]).read_bytes()
                 else:
-                    raise RefusedError(400, message=f"no operation {line['key']}")
+                    del files[value["path"]]
             oid = repo.commit(branch, files, header["summary"])
         self._json({"commitUrl": f"{self.server.url}/{repo_id}/commit/{oid}", "commitOid": oid})
 
     def _batch(self, asked: dict[str, Any]) -> None:
-        objects: list[dict[str, Any]] = []
         for item in asked["objects"]:
-            entry = {"oid": item["oid"], "size": item["size"]}
             if not (self.server.blobs / item["oid"]).is_file():
-                entry["actions"] = {"upload": {"href": f"{self.server.url}/lfs/{item['oid']}"}}
-            objects.append(entry)
-        self._json({"transfer": "basic", "objects": objects})
+                item["actions"] = {"upload": {"href": f"{self.server.url}/lfs/{item['oid']}"}}
+        self._json({"transfer": "basic", "objects": asked["objects"]})
 
     def _receive(self, oid: str, body: bytes) -> None:
         if hashlib.sha256(body).hexdigest() != oid:
             raise RefusedError(400, message="the content is not what its hash says")
-        self.server.keep(body)
+        (self.server.blobs / oid).write_bytes(body)
         self.server.uploaded.append(oid)
         self._json({})
 
     def _resolve(self, repo: Repo, revision: str, name: str) -> None:
         commit = repo.resolve(revision)
-        if commit is None:
-            raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
-        file = repo.commits[commit].get(name)
-        if file is None:
+        if name not in repo.commits[commit]:
             raise RefusedError(404, "EntryNotFound", "Entry not found")
-        data, status = (self.server.blobs / file.sha256).read_bytes(), 200
-        etag = file.sha256 if file.lfs else file.oid
-        headers = {"X-Repo-Commit": commit, "ETag": f'"{etag}"', "Content-Type": "application/octet-stream"}
-        if wanted := re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", "")):
-            first = int(wanted[1])
-            headers["Content-Range"] = f"bytes {first}-{len(data) - 1}/{len(data)}"
-            data, status = data[first:], 206
-        self._send(status, data, headers)
+        data = repo.commits[commit][name]
+        etag = f'"{_oid(name, data)}"'
+        headers = {"X-Repo-Commit": commit, "ETag": etag, "Content-Type": "application/octet-stream"}
+        self._send(200, data, headers)
 
 
-def git_oid(data: bytes) -> str:
+def _oid(name: str, data: bytes) -> str:
+    """What LFS or Git names a file by."""
+    if name.endswith(LARGE):
+        return hashlib.sha256(data).hexdigest()
     return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
 
 
-def _listed(name: str, file: File) -> dict[str, Any]:
-    entry: dict[str, Any] = {"type": "file", "path": name, "size": file.size, "oid": file.oid}
-    if file.lfs:
-        entry["lfs"] = {"oid": file.sha256, "size": file.size, "pointerSize": 130}
+def _listed(name: str, data: bytes) -> dict[str, Any]:
+    entry: dict[str, Any] = {"type": "file", "path": name, "size": len(data), "oid": _oid(name, data)}
+    if name.endswith(LARGE):
+        entry["lfs"] = {"oid": entry["oid"], "size": len(data), "pointerSize": 130}
     return entry
 
 
-def _mode(path: str, files: dict[str, File]) -> dict[str, Any]:
+def _mode(path: str, files: Files) -> dict[str, Any]:
     mode = "lfs" if path.endswith(LARGE) else "regular"
     answer = {"path": path, "uploadMode": mode, "shouldIgnore": False}
-    there = files.get(path)
-    if there is not None and there.lfs == (mode == "lfs"):
-        answer["oid"] = there.sha256 if there.lfs else there.oid
-    return answer
+    return answer | ({"oid": _oid(path, files[path])} if path in files else {})
 
 
 @contextmanager
 def serving(folder: Path) -> Iterator[HubServer]:
     """A server of its own, until the end."""
     folder.mkdir(parents=True, exist_ok=True)
-    server = HubServer(folder)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    with HubServer(folder) as server:
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
 
 
 def environment(server: HubServer, home: Path, token: str | None = WRITER) -> dict[str, str]:

@@ -26,13 +26,13 @@ FULL = "full"  # a folder that nothing can be written into
 
 
 class LightInference:
-    """Answers at once with noise drawn from each request's seed; on request breaks at the next decision."""
+    """Answers at once with noise drawn from each request's seed; breaks on request."""
 
     def __init__(self, *arguments: Any) -> None:
         self._name, in_cluster = arguments[-2:]
         self._host = node_address(in_cluster)
         self._broken: asyncio.Future[None] = asyncio.get_event_loop().create_future()
-        self._version, self._failing = 0, False
+        self._version = 0
         self._server: Server | None = None
         self._serving = asyncio.Event()
 
@@ -60,12 +60,10 @@ class LightInference:
         return self._server.address
 
     async def fail(self) -> None:
-        self._failing = True
+        self._broken.set_exception(ArithmeticError("the forward pass fell over"))
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
         await self._serving.wait()
-        if self._failing and not self._broken.done():
-            self._broken.set_exception(ArithmeticError("the forward pass fell over"))
         if self._broken.done():
             raise ServiceStoppedError("the inference service has stopped")
         return [_decision(request, self._version) for request in requests]
@@ -136,9 +134,7 @@ class LightTrainer:
         return self._publisher.newer_than(reader, version)
 
     def metrics(self) -> list[dict[str, float]]:
-        with self._lock:
-            records, self._records = self._records, []
-        return records
+        return self.hold()[1]
 
     def hold(self) -> tuple[int, list[dict[str, float]]]:
         with self._lock:

@@ -9,16 +9,9 @@ ROUNDING = 1e-4  # error of a float32 network, relative to its largest number; f
 
 
 def assert_close(found: Any, expected: Any, *, rel: float = ROUNDING, largest: float = 0.0) -> None:
-    """Asserts that no entry is off by more than `rel` times the largest expected one.
+    """Asserts that no entry is off by more than `rel` times the largest expected one; whole ones are equal.
 
-    A sum is rounded in proportion to its terms, so where they cancel the error is large beside the entry. An
-    absolute tolerance would depend on the numbers' unit.
-
-    Args:
-        found: a number, an array or a tensor, of the shape of `expected`.
-        expected: the same; whole numbers must be equal.
-        rel: above rounding and below the smallest real error.
-        largest: size of the terms, where they may cancel in all the entries.
+    A sum is rounded in proportion to its terms: where these cancel in all entries, `largest` is their size.
     """
     mine, theirs = (torch.as_tensor(x).detach() for x in (found, expected))
     assert mine.shape == theirs.shape, f"{tuple(mine.shape)} is not {tuple(theirs.shape)}"

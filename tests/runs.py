@@ -9,11 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, RatioConfig
+import pytest
+
+from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
@@ -29,10 +32,6 @@ if TYPE_CHECKING:
     from accerl_lerobot.engines.local import LocalEngine
 
 HANGS_S = 240.0
-ALGORITHMS = [
-    name for name, kind in AlgorithmConfig.get_known_choices().items() if issubclass(kind, RatioConfig)
-]
-"""Names of the algorithms with a likelihood ratio."""
 
 
 def pip_installed(site: Path, *sources: Path) -> dict[str, str]:
@@ -49,31 +48,32 @@ def replacing(arguments: list[str], *more: str) -> list[str]:
     return [a for a in arguments if a.partition("=")[0] not in names] + list(more)
 
 
+def changed(config: RunConfig, **sections: Any) -> RunConfig:
+    """The config with other sections, or with other fields of a section where a dict is given."""
+    given = {k: replace(getattr(config, k), **v) if isinstance(v, dict) else v for k, v in sections.items()}
+    return replace(config, **given)
+
+
 def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
-    """A run on the simulated environment from `checkpoint`; `sections` replaces whole sections."""
-    defaults: dict[str, Any] = {
-        "env": SimulatedConfig(max_steps=16),
-        "policy": PolicyConfig(path=str(checkpoint), device="cpu"),
-        "rollout": RolloutConfig(environments=4, segment_length=3),
-        "replay": ReplayConfig(
+    """A run on the simulated environment from `checkpoint`, `changed` by `sections`."""
+    config = RunConfig(
+        env=SimulatedConfig(max_steps=16),
+        policy=PolicyConfig(path=str(checkpoint), device="cpu"),
+        rollout=RolloutConfig(environments=4, segment_length=3),
+        replay=ReplayConfig(
             capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=2.0
         ),
-        "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
-        "evaluation": EvaluationConfig(episodes=6, videos=1),
-        "launch": LaunchConfig(stall_s=120),
-    }
-    return RunConfig(**{**defaults, **sections})
+        trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
+        evaluation=EvaluationConfig(episodes=6, videos=1),
+        launch=LaunchConfig(stall_s=120),
+    )
+    return changed(config, **sections)
 
 
 def off_policy_run(checkpoint: Path, **sections: Any) -> RunConfig:
     """The same for an algorithm that keeps whole episodes in its own memory: by default the chunk critic."""
-    sizes = {"capacity": 64, "min_decisions": 16, "max_unlearned_decisions": 32, "samples_per_insert": 1}
-    defaults: dict[str, Any] = {
-        "algorithm": ChunkCriticConfig(),
-        "rollout": RolloutConfig(environments=4, segment_length=4),
-        "replay": ReplayConfig(**sizes),
-    }
-    return tiny_run(checkpoint, **{**defaults, **sections})
+    in_memory = {"rollout": {"segment_length": 4}, "replay": {"samples_per_insert": 1.0}}
+    return changed(tiny_run(checkpoint, algorithm=ChunkCriticConfig(), **in_memory), **sections)
 
 
 def polls(engine: Engine) -> Iterator[Progress]:
@@ -85,7 +85,6 @@ def polls(engine: Engine) -> Iterator[Progress]:
 
 
 def collect(engine: Engine, group: str, count: int) -> list[EpisodeResult]:
-    """Polls until `group` has `count` results."""
     results: list[EpisodeResult] = []
     for progress in polls(engine):
         results += [e for e in progress.episodes if e.plan.group == group]
@@ -96,27 +95,20 @@ def collect(engine: Engine, group: str, count: int) -> list[EpisodeResult]:
 
 def drive(engine: Engine) -> list[Progress]:
     """Polls until the training is done; everything that was reported."""
+    return until(engine, None)
+
+
+def until(engine: Engine, version: int | None) -> list[Progress]:
+    """Polls until so many updates have been made, or all; everything that was reported."""
     history: list[Progress] = []
     for progress in polls(engine):
         history.append(progress)
-        if progress.done:
+        if progress.done if version is None else progress.version >= version:
             break
     return history
 
 
-def until(engine: Engine, version: int) -> list[Progress]:
-    """Polls until so many updates have been made; everything that was reported."""
-    history: list[Progress] = []
-    for progress in polls(engine):
-        history.append(progress)
-        if progress.version >= version:
-            break
-    return history
-
-
-def local_engine(
-    config: RunConfig, tasks: tuple[str, ...] = ("match",), state: Path | None = None
-) -> LocalEngine:
+def local_engine(config: RunConfig, tasks: tuple[str, ...] = ("match",), state: Any = None) -> LocalEngine:
     """The engine in one process, as a run makes it."""
     local = replace(config, launch=replace(config.launch, engine="local"))
     spec = replace(make_environment(config.env).spec, tasks=tasks)
@@ -125,27 +117,19 @@ def local_engine(
 
 def trained(config: RunConfig) -> tuple[list[Progress], LocalEngine]:
     """A run in one process from beginning to end: everything that was reported, and its engine."""
-    engine = local_engine(config)
-    try:
+    with closing(local_engine(config)) as engine:
         engine.train()
         return drive(engine), engine
-    finally:
-        engine.close()
 
 
 def updates(history: Sequence[Progress]) -> list[dict[str, float]]:
-    """The metrics of all updates that were reported."""
     return [update for progress in history for update in progress.updates]
 
 
 def records(run: Path, kind: str = "") -> list[dict[str, Any]]:
     """The lines of a run's ``metrics.jsonl``, or those of a kind; all that JSON does not know is an error."""
-
-    def constant(name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
     lines = (run / METRICS).read_text().splitlines()
-    found = [json.loads(line, parse_constant=constant) for line in lines]
+    found = [json.loads(line, parse_constant=pytest.fail) for line in lines]
     return [record for record in found if not kind or record["kind"] == kind]
 
 

@@ -5,17 +5,17 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import yaml
 
-import accerl_lerobot
 from accerl_lerobot import RunConfig, evaluate, load_config, load_policy, resume, train
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.run import train as run
 from tests.test_run import local_run
 
@@ -28,40 +28,24 @@ def test_the_package_loads_nothing_until_it_is_used():
         "from accerl_lerobot import RunConfig, train; assert 'lerobot.policies' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-    with pytest.raises(AttributeError, match="no attribute 'practise'"):
-        accerl_lerobot.practise  # noqa: B018
 
 
 def test_settings_are_those_of_the_command_line():
-    changes = {
-        "env.task": "drawer-open-v3",
-        "seed": 3,
-        "evaluation.before": False,
-        "trainer.betas": [0.9, 0.99],
-    }
-    config = load_config("recipes/quickstart.yaml", changes)
-    assert isinstance(config, RunConfig)
-    assert config.env.tasks == ("drawer-open-v3",) and config.seed == 3  # type: ignore[attr-defined]
-    assert not config.evaluation.before and config.trainer.betas == (0.9, 0.99)
-    assert load_config(changes={"policy.revision": None}).policy.revision is None
-    with pytest.raises(InputError, match=r"trainer\.update=3: no such field; did you mean trainer\.updates"):
-        load_config(changes={"trainer.update": 3})
+    changes = {"env.task": "drawer-open-v3", "policy.revision": None, "trainer.betas": [0.9, 0.99]}
+    config: Any = load_config("recipes/quickstart.yaml", changes)
+    assert config.env.tasks == ("drawer-open-v3",) and config.trainer.betas == (0.9, 0.99)
+    assert config.policy.revision is None
 
 
 def test_a_revision_counts_with_any_policy(monkeypatch: pytest.MonkeyPatch):
-    measured: list[str | None] = []
-
-    def play(config: RunConfig, console: object) -> list[EpisodeResult]:
-        measured.append(config.policy.revision)
-        return []
-
-    monkeypatch.setattr(run, "play_evaluation", play)
+    played = MagicMock(return_value=[])
+    monkeypatch.setattr(run, "play_evaluation", played)
     config = RunConfig(policy=PolicyConfig(path="me/policy", revision="v1"))
     evaluate(config)
     evaluate(config, revision="v2")
     evaluate(config, policy="me/other", revision="v3")
     evaluate(config, policy="me/other")
-    assert measured == ["v1", "v2", "v3", None]
+    assert [call.args[0].policy.revision for call in played.mock_calls] == ["v1", "v2", "v3", None]
 
 
 def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -80,34 +64,26 @@ def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path, monkey
     further = resume("~/run", {"trainer.updates": 14})
     assert further.summary["updates"] == 14 and further.directory == result.directory
 
-    policy, environment = load_policy(further.policy), make_environment(config.env)
-    observation = environment.reset(3, "match")
+    policy, observation = load_policy(further.policy), make_environment(config.env).reset(3, "match")
     chunk = policy.act(observation)
-    assert chunk.shape[1] == environment.spec.action_dim and np.isfinite(chunk).all()
+    assert chunk.shape[1] == 2 and np.isfinite(chunk).all()
     assert not np.array_equal(chunk, policy.act(observation)), "a flow policy samples"
     assert np.array_equal(chunk, load_policy(further.policy).act(observation))
-
-
-def test_what_is_no_run_is_refused(tiny_checkpoint: Path, tmp_path: Path):
     with pytest.raises(InputError, match="resume=True: use accerl_lerobot.resume"):
-        train(local_run(tiny_checkpoint, tmp_path / "run", resume=True))
-    with pytest.raises(InputError, match="no such file"):
-        resume(tmp_path)
+        train(RunConfig(resume=True))
 
 
 @pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path):
-    """Its cells one after another, as Jupyter runs them, on a recipe that is cut short."""
     cells = json.loads((EXAMPLES / "improve_a_policy.ipynb").read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     script = tmp_path / "notebook.py"
     # The recorder's workers import the main module again.
     script.write_text("if __name__ == '__main__':\n" + "".join(f"    {line}\n" for line in code.splitlines()))
     recipe = yaml.safe_load((EXAMPLES / "simulated.yaml").read_text())
-    recipe["demos"]["episodes"] = 4
-    recipe["sft"]["steps"] = 5
-    recipe["trainer"]["updates"] = 3  # the critic's warm-up
-    recipe["evaluation"]["episodes"] = 8
+    short = {"demos": {"episodes": 4}, "sft": {"steps": 5}, "trainer": {"updates": 3}}  # the critic's warm-up
+    for section, fields in (short | {"evaluation": {"episodes": 8}}).items():
+        recipe[section] |= fields
     (tmp_path / "simulated.yaml").write_text(yaml.safe_dump(recipe))
     command = [sys.executable, str(script)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900)

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line as a user meets it: help at once, verbs, exit codes, nothing left behind."""
 
-from __future__ import annotations
-
-import errno
 import json
 import logging
 import os
@@ -11,43 +8,27 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
-import yaml
 from rich.table import Table
 
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
-from accerl_lerobot.engines.config import LaunchConfig, encode
-from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError
-
-if TYPE_CHECKING:
-    from accerl_lerobot.run.train import Run
-
-ROOT = Path(__file__).parents[1]
-QUICKSTART = ROOT / "recipes" / "quickstart.yaml"
+from accerl_lerobot.run.train import Run
 
 
 def test_help_answers_without_torch_or_lerobot() -> None:
     code = (
         "import sys; from accerl_lerobot import cli; assert cli.main(['--help']) == 0\n"
-        "sys.stderr.write(str({'torch', 'lerobot', 'ray', 'draccus', 'numpy'} & set(sys.modules) or None))"
+        "assert not {'torch', 'lerobot', 'ray', 'draccus', 'numpy'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr == "None"
-    for verb in cli.VERBS:
-        assert f"\n  {verb} " in done.stdout
-
-
-def test_an_unknown_verb(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["trian"]) == 2
-    assert capsys.readouterr().err.startswith("accerl: VERB='trian': use one of train, demos, ")
+    assert all(f"\n  {verb} " in done.stdout for verb in cli.VERBS)
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
@@ -56,12 +37,17 @@ def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.
     out = capsys.readouterr().out
     assert out.startswith(f"usage: accerl {verb}")
     assert out.count("\n") <= 60 and max(map(len, out.splitlines())) <= 115
-    if verb == "train":
-        assert "  --trainer.lr=" in out and "--algorithm.clip_low" not in out
-        assert "--algorithm.type=gipo" in out and "| ppo" in out and "recipes: act_pusht, deploy" in out
-        assert cli.main(["train", "--help=trainer"]) == 0
-        out = capsys.readouterr().out
-        assert "0 freezes it. A number in [0," in out and "--policy" not in out
+
+
+def test_help_names_choices_and_recipes_and_of_a_section_all_fields(capsys) -> None:
+    assert cli.main(["trian"]) == 2
+    assert capsys.readouterr().err.startswith("accerl: VERB='trian': use one of train, demos, ")
+    cli.main(["train", "--help"])
+    out = capsys.readouterr().out
+    assert "--algorithm.type=gipo" in out and "| ppo" in out and "recipes: act_pusht, deploy" in out
+    cli.main(["train", "--help=trainer"])
+    out = capsys.readouterr().out
+    assert "0 freezes it. A number in [0," in out and "--policy" not in out
 
 
 class RayTaskError(InputError):
@@ -85,37 +71,32 @@ class RayTaskError(InputError):
     ids=lambda value: type(value).__name__,
 )
 def test_every_error_is_one_line(error, code, line, monkeypatch, capsys, caplog):
-    def broken(arguments: list[str]) -> int:
-        raise error
-
-    monkeypatch.setattr(verbs, "train", broken)
+    monkeypatch.setattr(verbs, "train", Mock(side_effect=error))
     with caplog.at_level("DEBUG", "accerl_lerobot.cli"):
         assert cli.main(["train"]) == code
     out, err = capsys.readouterr()
     assert out == "" and err.startswith(f"accerl: {line}") and err.count("\n") == 1
-    assert ("in broken" in caplog.text) is (code in (1, 2)), "the traceback"
+    assert ("Traceback (most recent" in caplog.text) is (code in (1, 2))
 
 
 HOSTILE = "\x1b[2J\x9b2J\u202egpj.\u2028x\x07"
 
 
-@pytest.mark.parametrize("error", [InputError(f"a{HOSTILE}", 1, HOSTILE), RuntimeError(HOSTILE)])
-def test_control_characters_are_escaped_where_a_message_becomes_a_line(error, monkeypatch, capsys):
+def test_control_characters_are_escaped_where_a_message_becomes_a_line(monkeypatch, capsys):
     def broken(arguments: list[str]) -> int:
         logging.getLogger("accerl_lerobot").warning("the file says %s", HOSTILE)
-        console = Console()
-        console.say(HOSTILE)
         table = Table(HOSTILE)
         table.add_row(HOSTILE)
-        console.rich.print(table)
-        raise error
+        Console().rich.print(table)
+        Console().say(HOSTILE)
+        raise InputError(f"a{HOSTILE}", 1, HOSTILE)
 
     monkeypatch.setattr(verbs, "train", broken)
     monkeypatch.setattr(logging.root, "handlers", [])
     cli.main(["train"])
     err = capsys.readouterr().err
     assert all(character.isprintable() or character == "\n" for character in err)
-    assert err.count("\\x1b[2J") == 5 + isinstance(error, InputError) and "\\u202e" in err
+    assert err.count("\\x1b[2J") == 6 and "\\u202e" in err
 
 
 def test_a_reader_that_has_gone_ends_the_command_quietly() -> None:
@@ -125,35 +106,25 @@ def test_a_reader_that_has_gone_ends_the_command_quietly() -> None:
 
 
 class TestTrain:
-    """`accerl train` around `run.train`."""
-
     @pytest.fixture
     def arguments(self, tmp_path: Path, tiny_checkpoint: Path) -> list[str]:
         places = [f"--policy.path={tiny_checkpoint}", f"--output_dir={tmp_path / 'run'}"]
         return ["train", "--env.type=simulated", "--launch.engine=local", *places]
 
     def test_prints_the_summary(self, arguments, tmp_path, capsys, monkeypatch):
-        seen: dict[str, Any] = {}
-
-        def execute(run: Run) -> dict[str, Any]:
-            seen.update(config=run.config, directory=run.directory)
-            before = {"success_before": 0.25, "ci95_before": [0.2, 0.3], "tasks_before": {"a": 1}}
-            after = {"success_after": 0.75, "ci95_after": [0.7, 0.8], "n_after": 100, "seeds": [1, 2]}
-            counts = {"episodes": 412, "env_steps": 43210, "updates": 9, "wall_s": 279.0}
-            return before | after | counts
-
-        monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", execute)
-        assert cli.main([*arguments, "--trainer.lr=1e-5"]) == 0
+        before = {"success_before": 0.25, "ci95_before": [0.2, 0.3], "tasks_before": {"a": 1}}
+        after = {"success_after": 0.75, "ci95_after": [0.7, 0.8], "n_after": 100, "seeds": [1, 2]}
+        counts = {"episodes": 412, "env_steps": 43210, "updates": 9, "wall_s": 279.0}
+        monkeypatch.setattr(Run, "execute", lambda run: before | after | counts)
+        assert cli.main(arguments) == 0
         out, err = capsys.readouterr()
         policy = tmp_path / "run/checkpoints/last/pretrained_model"
         told = json.loads(out)
         assert (told["success_after"], told["ci95_after"], told["env_steps"]) == (0.75, [0.7, 0.8], 43210)
         assert told["policy"] == str(policy) and told["summary"] == str(tmp_path / "run/summary.json")
         assert "seeds" not in told and "tasks_before" not in told
-        counts = "412 episodes, 43,210 env steps; 4 min 39 s"
-        assert f"success 25\xa0% [20, 30] → 75\xa0% [70, 80] of 100; {counts}\n" in err
-        assert seen["directory"] == tmp_path / "run" and seen["directory"].is_dir()
-        assert seen["config"].trainer.lr == 1e-5
+        said = "412 episodes, 43,210 env steps; 4 min 39 s"
+        assert f"success 25\xa0% [20, 30] → 75\xa0% [70, 80] of 100; {said}\n" in err
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
         arguments[-1] += "2"
         assert cli.main(arguments) == 0
@@ -164,12 +135,10 @@ class TestTrain:
         self, work, arguments, tmp_path, monkeypatch
     ):
         def execute(run: Run) -> dict[str, Any]:
-            (run.directory / "config.yaml").write_text("seed: 0\n")
-            if work:
-                (run.directory / "demos").mkdir()
+            (run.directory / ("demos" if work else "config.yaml")).touch()
             raise InputError("MUJOCO_GL", "", "install it")
 
-        monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", execute)
+        monkeypatch.setattr(Run, "execute", execute)
         assert cli.main(arguments) == 2
         assert (tmp_path / "run").exists() is work
 
@@ -179,14 +148,13 @@ def test_eval_in_one_process(tmp_path, tiny_checkpoint, capsys):
     arguments = ["eval", "--env.type=simulated", "--env.max_steps=8", f"--policy.path={tiny_checkpoint}"]
     arguments += ["--evaluation.episodes=4", "--launch.engine=local", f"--output_dir={out}"]
     assert cli.main(arguments) == 0
-    stdout, stderr = capsys.readouterr()
-    summary, kept = json.loads(stdout), json.loads((out / "evaluation.json").read_text())
+    summary = json.loads(capsys.readouterr().out)
+    kept = json.loads((out / "evaluation.json").read_text())
     seeds = kept["tasks"]["match"].pop("seeds")
     assert seeds[1] == seeds[0] + 3 and len(kept["tasks"]["match"].pop("failed_seeds")) < 5
     assert summary == kept, "the seeds are in the file alone"
     assert summary["n"] == 4 and 0 <= summary["ci95"][0] <= summary["success"] <= summary["ci95"][1] <= 1
     assert len(list(out.glob("match_*.mp4"))) == 4
-    assert "95 % Wilson" in stderr
     assert cli.main(arguments) == 2
     assert "the folder exists" in capsys.readouterr().err
 
@@ -205,31 +173,6 @@ def test_a_verb_that_is_asked_to_stop_ends_what_it_has_started(monkeypatch: pyte
     before = signal.getsignal(signal.SIGTERM)
     assert cli.main(["demos"]) == 128 + signal.SIGTERM and ended
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (OSError(errno.ENOSPC, "full"), "OSError: [Errno 28] full"),
-        (WorkerError("replay:\nOSError: No space left on device"), "WorkerError: replay: … OSError: No"),
-    ],
-)
-def test_a_run_that_cannot_go_on_says_why_and_how_to_resume(error, said, tmp_path, monkeypatch, capsys):
-    from benchmarks.light_run import light_config, light_policy
-
-    def fails(run: Run) -> None:
-        raise error
-
-    monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", fails)
-    recipe, folder = tmp_path / "light.yaml", tmp_path / "run"
-    config = replace(light_config(updates=1), launch=LaunchConfig(engine="local"))
-    recipe.write_text(yaml.safe_dump(encode(config)))
-    monkeypatch.setattr(verbs, "train", partial(verbs.train, load=light_policy()))
-    assert cli.main(["train", f"--config_path={recipe}", f"--output_dir={folder}"]) == 1
-    *_, resume, last = capsys.readouterr().err.splitlines()
-    how = f"accerl train --resume=true --config_path={folder}/config.yaml"
-    assert resume.endswith(f"failed; to resume: {how}")
-    assert last.startswith(f"accerl: {said}") and f"the traceback is in {folder / 'error.log'}" in last
 
 
 @pytest.mark.parametrize(

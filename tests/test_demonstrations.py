@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Demonstrations in an off-policy learner's memory, against the dataset's frames."""
 
-import logging
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +29,6 @@ from tests.runs import off_policy_run
 from tests.tiny_datasets import labels, record_dataset, write_dataset
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
-STATE_SIZE = 5  # of its ``observation.environment_state``
 K, COST = 4, 0.25
 
 
@@ -44,32 +42,25 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
 @pytest.fixture
 def like() -> Segment:
     """An explored episode of one decision."""
-    environment = make_environment(ENV)
-    observation = environment.reset(3, environment.spec.tasks[0])
+    observation = make_environment(ENV).reset(3, "match")
     seen = {name: np.stack([value] * 2) for name, value in observation.items() if name != "task"}
     return make_segment(
         "explored", 1, observations=seen, task=str(observation["task"]),
-        actions=np.zeros((1, K, environment.spec.action_dim), np.float32), steps=np.array([K]),
+        actions=np.zeros((1, K, 2), np.float32), steps=np.array([K]),
         terminated=True, time_limit=ENV.max_steps, origin=SegmentStart("match", 0, 0),
     )  # fmt: skip
 
 
 def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, like: Segment):
     data = LeRobotDataset("a/b", root=dataset.root)
-    ends = list(
-        zip(data.meta.episodes["dataset_from_index"], data.meta.episodes["dataset_to_index"], strict=True)
-    )
+    ends = zip(*(data.meta.episodes[f"dataset_{end}_index"] for end in ("from", "to")), strict=True)
     episodes = [[data[i] for i in range(first, last)] for first, last in ends]
     read = list(demonstrations(dataset, COST, like))
-    expected = [(e, phase) for e in range(4) for phase in range(min(K, len(episodes[e])))]
-    assert len(read) == len(expected)
-    for segment, (e, phase) in zip(read, expected, strict=True):
-        frames = episodes[e]
+    expected = [(frames, phase) for frames in episodes for phase in range(min(K, len(frames)))]
+    for segment, (frames, phase) in zip(read, expected, strict=True):
         won = any(bool(frame["next.success"]) for frame in frames)
         assert segment.success is won
-        rewards = np.zeros(len(segment))
-        rewards[-1] = won
-        np.testing.assert_allclose(segment.reward, rewards - COST)
+        np.testing.assert_allclose(segment.reward, [*[-COST] * (len(segment) - 1), won - COST])
         late = segment.observations[ENVIRONMENT_STATE][:-1, -1]
         np.testing.assert_allclose(segment.elapsed, late, atol=1e-6)
         for t in range(len(segment)):
@@ -87,21 +78,19 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
 
 
 @pytest.mark.parametrize(
-    ("label", "length", "rewards", "success"),
+    ("label", "rewards", "success"),
     [
-        ({"next.success": [0, 0, 1, 1, 1, 1]}, 3, [0, 0, 1], True),
-        ({"next.success": [1] * 6}, 6, [0, 0, 0, 0, 0, 1], True),  # the episode's label, at every frame
-        ({"next.success": [0] * 6}, 6, [0] * 6, False),
-        ({"next.success": [0, 1, 0, 0, 0, 0]}, 2, [0, 1], True),
-        ({"next.success": [0, 1, 1, 1, 1, 1], "next.reward": [-1, -2, 0, 0, 0, 0]}, 2, [-1, -2], True),
-        ({"next.reward": [0, 0, 0, 1, 1, 1]}, 4, [0, 0, 0, 1], True),
-        ({"next.reward": [0] * 6}, 6, [0] * 6, False),
-        ({}, 6, [0, 0, 0, 0, 0, 1], True),
+        ({"next.success": [0, 0, 1, 1, 1, 1]}, [0, 0, 1], True),
+        ({"next.success": [1] * 6}, [0, 0, 0, 0, 0, 1], True),  # the episode's label, at every frame
+        ({"next.success": [0] * 6}, [0] * 6, False),
+        ({"next.success": [0, 1, 0, 0, 0, 0]}, [0, 1], True),
+        ({"next.success": [0, 1, 1, 1, 1, 1], "next.reward": [-1, -2, 0, 0, 0, 0]}, [-1, -2], True),
+        ({"next.reward": [0, 0, 0, 1, 1, 1]}, [0, 0, 0, 1], True),
+        ({"next.reward": [0] * 6}, [0] * 6, False),
+        ({}, [0, 0, 0, 0, 0, 1], True),
     ],
 )
-def test_labels_of_an_episode(
-    label: dict[str, list[int]], length: int, rewards: list[float], success: bool, tmp_path: Path
-):
+def test_labels_of_an_episode(label: dict[str, list[int]], rewards: list[int], success: bool, tmp_path: Path):
     dataset = write_dataset(
         tmp_path / "data", ("go",), {name: labels("float32") for name in label},
         lambda name, episode, step: [label[name][step]] if name in label else None,
@@ -109,23 +98,19 @@ def test_labels_of_an_episode(
     shapes = {"observation.state": (4,), "action": (2,)}
     (segment,) = recorded(dataset, open_metadata(dataset), shapes, 1, 100, 1, time_limit=100)
     assert (segment.reward.tolist(), segment.success, segment.task) == (rewards, success, "go")
-    assert len(segment) == length and segment.observations["observation.state"].shape == (length + 1, 4)
+    assert segment.observations["observation.state"].shape == (len(rewards) + 1, 4)
 
 
-def test_of_a_long_dataset_only_a_part_is_read(
-    dataset: DatasetConfig, like: Segment, monkeypatch: pytest.MonkeyPatch
-):
-    frames = LeRobotDataset("a/b", root=dataset.root).meta.total_frames
+def test_of_a_long_dataset_only_a_part_is_read(dataset: DatasetConfig, like: Segment, monkeypatch):
+    frames = open_metadata(dataset).total_frames
     monkeypatch.setattr(module, "ROWS", frames // K // 2)
     read = list(demonstrations(dataset, COST, like))
     assert len(read) == 2 and sum(map(len, read)) <= frames // K // 2 + 2
 
 
-def test_the_memory_begins_with_them_and_is_restored_without(
-    dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
-):
+def test_the_memory_begins_with_them_and_is_restored_without(dataset, like: Segment, tiny_checkpoint: Path):
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-    adapter = with_teacher(load_adapter, SimulatorStateConfig(), STATE_SIZE, policy)
+    adapter = with_teacher(load_adapter, SimulatorStateConfig(), 5, policy)  # numbers of its state
     adapter.demonstrations = partial(demonstrations, dataset, COST)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
@@ -137,14 +122,11 @@ def test_the_memory_begins_with_them_and_is_restored_without(
     assert again.step([like])["memory_decisions"] == rows + 2
 
 
-def test_they_are_looked_at_before_the_run_begins(
-    dataset: DatasetConfig, tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
+def test_they_are_looked_at_before_the_run_begins(dataset, tiny_checkpoint: Path, tmp_path: Path, caplog):
     config = off_policy_run(tiny_checkpoint, env=ENV, dataset=dataset)
-    with caplog.at_level(logging.WARNING):
-        check_start(config)
-        assert "does not join" not in caplog.text
-        check_start(replace(config, env=replace(ENV, image_size=48)))
-        assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
+    check_start(config)
+    assert "does not join" not in caplog.text
+    check_start(replace(config, env=replace(ENV, image_size=48)))
+    assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
     with pytest.raises(InputError, match=r"^dataset\.root="):
         check_start(replace(config, dataset=DatasetConfig(repo_id="a/b", root=str(tmp_path))))

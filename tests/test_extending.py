@@ -45,16 +45,18 @@ NAMED = [f"--algorithm.discover_packages_path={PACKAGE}.algorithm", f"--algorith
 
 
 def forget() -> None:
-    for registry in (POLICIES, PLUGINS, PreTrainedConfig.get_known_choices()):
-        registry.pop(POLICY, None)  # type: ignore[attr-defined]
-    AlgorithmConfig.get_known_choices().pop(ALGORITHM, None)
-    for name in [name for name in sys.modules if name.partition(".")[0] == PACKAGE]:
+    kinds = [kind.get_known_choices() for kind in (PreTrainedConfig, AlgorithmConfig, StateModelConfig)]
+    for registry in (POLICIES, PLUGINS, *kinds):
+        for name in (POLICY, ALGORITHM, "rwr", "small_picture"):
+            registry.pop(name, None)
+    for name in [n for n in sys.modules if n.partition(".")[0] in (PACKAGE, "rwr", "small_picture")]:
         del sys.modules[name]
 
 
 @pytest.fixture(autouse=True)
 def unheard_of(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(SOURCE))
+    monkeypatch.syspath_prepend(str(EXAMPLES))
     forget()
     yield
     forget()
@@ -78,76 +80,43 @@ def named(checkpoint: Path) -> PolicyConfig:
     return PolicyConfig(path=str(checkpoint), device="cpu", discover_packages_path=PACKAGE)
 
 
-def test_the_likelihood(checkpoint: Path, observations: list[Observation]):
-    check_policy(named(checkpoint), observations)
-
-
-def another_velocity(policy: Any) -> None:
-    """A sampler that is not LeRobot's."""
-    stock = policy.predict_action_chunk
-    policy.predict_action_chunk = lambda *given, **more: 1.01 * stock(*given, **more)
-
-
-def mixed_batch(policy: Any) -> None:
-    """One decision depends on the others in its batch."""
-    alone = policy.features
-
-    def features(batch: Any) -> Any:
-        return alone(batch) + 0.1 * alone(batch).mean(0)
-
-    policy.features = features
-
-
-def no_gradient(policy: Any) -> None:
-    """The encoder's gradient is lost."""
-    attached = policy.features
-    policy.features = lambda batch: attached(batch).detach()
-
-
 @pytest.mark.parametrize(
-    ("mistake", "message"),
+    ("name", "changed", "message"),
     [
-        (another_velocity, "policy.type='mlp_flow': .*lerobot_policy_mlp_flow.*correct .*encode or stock"),
-        (mixed_batch, "of two decisions on one request, .* is off by"),
-        (
-            no_gradient,
+        (  # a sampler that is not LeRobot's
+            "predict_action_chunk", lambda chunk: 1.01 * chunk,
+            "policy.type='mlp_flow': .*lerobot_policy_mlp_flow.*correct .*encode or stock",
+        ),
+        (  # one decision depends on the others in its batch
+            "features", lambda features: features + 0.1 * features.mean(0),
+            "of two decisions on one request, .* is off by",
+        ),
+        (  # the encoder's gradient is lost
+            "features", lambda features: features.detach(),
             r"the log-prob does not depend on \['policy.encoder.0.weight', 'policy.encoder.0.bias'",
         ),
+        (  # the density leaves out executed actions
+            "_rows", lambda rows: torch.cat([rows[:, :1], 0 * rows[:, 1:]], 1),
+            "standard errors apart: the log-prob is not that of the actions",
+        ),
     ],
-)
-def test_mistakes_are_found(mistake, message, checkpoint, observations, monkeypatch):
-    module = importlib.import_module(f"{PACKAGE}.modeling_mlp_flow")
-    built = module.MLPFlowPolicy.__init__
-
-    def build(self: Any, config: Any) -> None:
-        built(self, config)
-        mistake(self)
-
-    monkeypatch.setattr(module.MLPFlowPolicy, "__init__", build)
+)  # fmt: skip
+def test_mistakes_are_found(name, changed, message, checkpoint, observations, monkeypatch):
+    policy = importlib.import_module(f"{PACKAGE}.modeling_mlp_flow").MLPFlowPolicy
+    owner = FlowFamily if name == "_rows" else policy
+    right = getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *given, **more: changed(right(*given, **more)))
     with pytest.raises((AssertionError, InputError), match=message):
         check_policy(named(checkpoint), observations)
 
 
-def test_a_density_that_leaves_out_executed_actions_is_found(checkpoint, observations, monkeypatch):
-    whole = FlowFamily._rows
-
-    def first_row(*arguments: Any) -> Any:
-        rows = whole(*arguments)
-        return torch.cat([rows[:, :1], 0 * rows[:, 1:]], 1)
-
-    monkeypatch.setattr(FlowFamily, "_rows", first_row)
-    with pytest.raises(
-        AssertionError, match="standard errors apart: the log-prob is not that of the actions"
-    ):
-        check_policy(named(checkpoint), observations)
-
-
-def test_it_acts(checkpoint: Path, observations: list[Observation]):
+def test_it_acts_with_a_right_likelihood(checkpoint: Path, observations: list[Observation]):
     with pytest.raises(InputError, match=rf"^policy\.type='{POLICY}': .*or name it: policy\.discover"):
         load_adapter(PolicyConfig(path=str(checkpoint)))
     policy = load_policy(checkpoint, device="cpu", discover_packages_path=PACKAGE)
     assert policy.act(observations[0]).shape == (4, 2)
     assert load_policy(checkpoint, device="cpu").history == 1, "once imported, it is known"
+    check_policy(named(checkpoint), observations)
 
 
 def test_a_file_alone_imports_no_package(checkpoint: Path, tmp_path: Path):
@@ -160,44 +129,32 @@ def test_a_file_alone_imports_no_package(checkpoint: Path, tmp_path: Path):
     assert dry_run_config(config).type == POLICY
 
 
-def test_the_off_policy_algorithm_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    try:
-        flags = ["--algorithm.discover_packages_path=rwr", "--algorithm.type=rwr"]
-        algorithm = parse(RunConfig, ["--config_path=few_shot", *flags]).algorithm
-        adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
-        update: Any = make_update(adapter, algorithm, TrainerConfig(warmup_updates=0, value_warmup_updates=0))
-        metrics = update.step([episode([0.0, 1.0]), episode([0.0])])
-        assert len(update.imitable()) == 3 and metrics["imitation_loss"] > 0
-        (loss,) = update.losses(np.arange(3), None, torch.tensor([1.0, 2.0, 3.0])).values()
-        weights = np.exp(np.array([algorithm.gamma, 1.0, 0.0]) / 0.25)
-        assert float(loss) == pytest.approx(weights @ [1, 2, 3] / weights.sum())
-    finally:
-        AlgorithmConfig.get_known_choices().pop("rwr", None)
-        sys.modules.pop("rwr", None)
+def example(name: str, section: str, *flags: str) -> RunConfig:
+    """A run with the module that a page of the documents shows."""
+    flags = (f"--{section}.discover_packages_path={name}", f"--{section}.type={name}", *flags)
+    return parse(RunConfig, ["--config_path=few_shot", *flags])
+
+
+def test_the_off_policy_algorithm_of_the_page(tiny_checkpoint: Path):
+    algorithm: Any = example("rwr", "algorithm").algorithm
+    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+    update: Any = make_update(adapter, algorithm, TrainerConfig(warmup_updates=0, value_warmup_updates=0))
+    metrics = update.step([episode([0.0, 1.0]), episode([0.0])])
+    assert len(update.imitable()) == 3 and metrics["imitation_loss"] > 0
+    (loss,) = update.losses(np.arange(3), None, torch.tensor([1.0, 2.0, 3.0])).values()
+    weights = np.exp(np.array([algorithm.gamma, 1.0, 0.0]) / 0.25)
+    assert float(loss) == pytest.approx(weights @ [1, 2, 3] / weights.sum())
 
 
 def test_the_world_model_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
-    flags = ["--world_model.discover_packages_path=small_picture", "--world_model.type=small_picture"]
-    try:
-        chosen = parse(RunConfig, ["--config_path=few_shot", "--env.environment_state=false", *flags])
-        config = off_policy_run(
-            tiny_checkpoint,
-            world_model=chosen.world_model,
-            trainer=TrainerConfig(updates=4, batch_decisions=16, value_warmup_updates=2),
-        )
-        _, engine = trained(config)
-        memory: Any = engine._update.memory
-        images = memory["observation.images.front"].reshape(-1, 4, 8, 4, 8, 3).mean((2, 4)) / 255
-        expected = np.concatenate(
-            [images.transpose(0, 3, 1, 2).reshape(-1, 48), memory["observation.state"]], 1
-        )
-        np.testing.assert_allclose(memory["state"][:, : expected.shape[1]], expected, rtol=1e-5, atol=1e-6)
-    finally:
-        StateModelConfig.get_known_choices().pop("small_picture", None)
-        sys.modules.pop("small_picture", None)
+    model = example("small_picture", "world_model", "--env.environment_state=false").world_model
+    trainer = TrainerConfig(updates=4, batch_decisions=16, value_warmup_updates=2)
+    _, engine = trained(off_policy_run(tiny_checkpoint, world_model=model, trainer=trainer))
+    memory: Any = engine._update.memory
+    images = memory["observation.images.front"].reshape(-1, 4, 8, 4, 8, 3).mean((2, 4)) / 255
+    expected = np.concatenate([images.transpose(0, 3, 1, 2).reshape(-1, 48), memory["observation.state"]], 1)
+    np.testing.assert_allclose(memory["state"][:, : expected.shape[1]], expected, rtol=1e-5, atol=1e-6)
 
 
 def test_it_trains_with_its_own_algorithm(checkpoint: Path):
@@ -223,8 +180,6 @@ images = {name: torch.zeros(1, *feature.shape) for name, feature in config.image
 action = after(policy.select_action(before({"observation.state": torch.zeros(1, 4), **images})))
 print(config.type, tuple(action.shape))
 """
-
-
 USE_REACH = """
 from accerl_lerobot.envs import LeRobotEnvConfig, make_environment
 
@@ -235,8 +190,7 @@ print(environment.reset(0, "reach")["observation.state"].shape)
 
 @pytest.mark.slow
 def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_path: Path):
-    """Policy, algorithm and environment by their names in a run on Ray; policy and environment as LeRobot's
-    plugins, which only pip has announced."""
+    """By their names in a run on Ray; policy and environment as LeRobot's plugins, too."""
     copies = tmp_path / "sources"  # pip builds there
     sources = [shutil.copytree(path, copies / path.name) for path in (SOURCE, REACH)]
     environment = pip_installed(tmp_path / "site", *sources)

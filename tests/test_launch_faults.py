@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of a run's processes: failures, hangs and kills.
-
-Which weights decide does not matter here, so inference and trainer are stand-ins that start at once; rollout
-and replay are real. The run with everything real is in ``test_launch.py``.
-"""
+"""Faults of a run's processes: failures, hangs and kills. Inference and trainer are stand-ins."""
 
 import os
 import signal
@@ -15,34 +11,28 @@ import pytest
 import ray
 
 from accerl_lerobot import errors
-from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
-from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout import worker as rollout_worker
-from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodeResult
 from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.victims import alive
 from tests.light_workers import FULL, HANGS, LightInference, WarningRollout
-from tests.runs import collect, drive, eventually, polls, until
+from tests.runs import collect, drive, eventually, polls, until, updates
 
 SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
 HARD = LatencyConfig(max_steps=16, tolerance=0.02, frame_ms=20.0)
-TWO = RolloutConfig(workers=2, environments=2, segment_length=3)
-ENDLESS = TrainerConfig(updates=1_000_000, batch_decisions=16)
 
 
 @pytest.fixture
 def engine(light_engine: Callable[..., RayEngine]) -> Callable[..., RayEngine]:
-    return lambda **sections: light_engine(**{"env": SLOW, **sections})
+    two: Any = {"rollout": {"workers": 2, "environments": 2}, "trainer": {"updates": 1_000_000}}
+    return lambda **sections: light_engine(**{"env": SLOW, **two, **sections})
 
 
 def until_failure(engine: RayEngine) -> str:
-    """Polls until the run ends with an error; its text."""
     with pytest.raises(RuntimeError) as caught:
         drive(engine)
     return str(caught.value)
@@ -54,22 +44,28 @@ def until_training(engine: RayEngine) -> None:
 
 
 def gone(pid: int) -> bool:
-    """True if a process ends soon."""
     return eventually(lambda: not alive(pid))
+
+
+def indices(results: list[EpisodeResult], group: str) -> list[int]:
+    """Of the group's episodes; and none that explored was reported twice."""
+    seeds = [r.plan.seed for r in results if r.plan.explore]
+    assert len(set(seeds)) == len(seeds)
+    return sorted(r.plan.index for r in results if r.plan.group == group)
 
 
 def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine, monkeypatch, caplog):
     """Warnings of workers are shown once, those of their last moments too."""
     monkeypatch.setattr(rollout_worker, "RolloutWorker", WarningRollout)
     errors.warn_once.cache_clear()
-    one = engine(rollout=TWO)
+    one = engine(trainer={"updates": 12})
     pids = one.pids()
     assert set(pids) == {"inference", "replay", "trainer", "rollout 0", "rollout 1"}
     one.plan(evaluation_plans(("match",), 5, "before"))
-    assert sorted(r.plan.index for r in collect(one, "before", 5)) == list(range(5))
+    assert indices(collect(one, "before", 5), "before") == list(range(5))
     one.train()
     history = drive(one)
-    assert [u["update"] for p in history for u in p.updates] == [float(i) for i in range(1, 13)]
+    assert [u["update"] for u in updates(history)] == [float(i) for i in range(1, 13)]
     assert history[-1].version == 12 and history[-1].replay["trained_decisions"] >= 12 * 16
     one.plan(evaluation_plans(("match",), 5, "after"))
     assert {r.versions for r in collect(one, "after", 5)} == {(12, 12)}
@@ -85,74 +81,52 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine, monkeypatch,
 
 def test_an_evaluation_has_no_trainer(engine):
     one = engine(learns=False)
-    assert set(one.pids()) == {"inference", "replay", "rollout 0"}
+    assert set(one.pids()) == {"inference", "replay", "rollout 0", "rollout 1"}
     one.plan(evaluation_plans(("match",), 5, "eval"))
     assert len(collect(one, "eval", 5)) == 5
 
 
 def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine):
-    launch = LaunchConfig(max_restarts=2)
-    one = engine(env=LatencyConfig(crash_after=30), rollout=RolloutConfig(environments=2), launch=launch)
+    one = engine(env=LatencyConfig(crash_after=30), rollout={"environments": 2}, launch={"max_restarts": 2})
     one.train()
-    restarts: list[float] = []
-    with pytest.raises(RuntimeError, match="rollout 0 worker failed for good after 2 restarts") as caught:
-        for progress in polls(one):
-            restarts.append(progress.rollout["restarts"])
-    assert max(restarts) == 2.0
-    text = str(caught.value)
+    text = until_failure(one)
+    assert text.startswith("rollout 0 worker failed for good after 2 restarts")
     assert "simulated crash after 30 env steps" in text and "simulated_environment.py" in text
 
 
-@pytest.mark.slow  # `test_launch` kills a rollout worker too
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_rollout_worker_that_is_lost_is_replaced_and_a_lost_replay_ends_the_run(
-    engine, how: signal.Signals
-):
-    """Two workers, so that one goes on; every planned episode has one result, whichever process plays it."""
-    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(stall_s=7.0))
+@pytest.mark.slow  # `test_launch` kills a rollout worker
+def test_a_rollout_worker_that_hangs_is_replaced_and_a_lost_replay_ends_the_run(engine):
+    one = engine(env=HARD, launch={"stall_s": 7.0})
     until_training(one)
     pid = one.pids()["rollout 1"]
     one.plan(evaluation_plans(("match",), 24, "during"))
     results: list[EpisodeResult] = list(one.poll().episodes)
-    os.kill(pid, how)
-    left = 5  # polls after everything has come: nothing comes twice later on
+    os.kill(pid, signal.SIGSTOP)
     for progress in polls(one):
         results += progress.episodes
-        if sum(r.plan.group == "during" for r in results) >= 24 and progress.rollout["restarts"] >= 1:
-            left -= 1
-        if not left:
+        if len(indices(results, "during")) >= 24 and progress.rollout["restarts"] >= 1:
             break
-    assert sorted(r.plan.index for r in results if r.plan.group == "during") == list(range(24))
-    explored = [r.plan.seed for r in results if r.plan.explore]
-    assert len(set(explored)) == len(explored)
+    assert indices(results, "during") == list(range(24))
     pids = one.pids()
     assert pids["rollout 1"] != pid and gone(pid)
-    os.kill(pids["replay"], how)
+    os.kill(pids["replay"], signal.SIGSTOP)
     with pytest.raises(WorkerError):
         drive(one)
-    one.close()
-    assert gone(pids["replay"])
 
 
-def fail(one: RayEngine, pid: int) -> None:
+def fail(one: RayEngine) -> None:
     ray.get(one._inference[-1].actor.fail.remote())
 
 
-def hangs(one: RayEngine, pid: int) -> None:
-    os.kill(pid, signal.SIGSTOP)
-
-
-@pytest.mark.parametrize(("lose", "replicas"), [(fail, 1), pytest.param(hangs, 2, marks=pytest.mark.slow)])
-def test_an_inference_replica_that_is_lost_is_replaced_alone(engine, lose: Any, replicas: int):
-    """Nothing is lost or doubled, and no version is older than one before."""
-    launch = LaunchConfig(stall_s=7.0 if lose is hangs else 120.0, max_restarts=1)
-    inference = InferenceConfig(workers=replicas)
-    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=launch, inference=inference)
-    name = "inference" if replicas == 1 else "inference 1"
+@pytest.mark.parametrize("hangs", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_an_inference_replica_that_is_lost_is_replaced_alone(engine, hangs: bool):
+    launch = {"stall_s": 7.0 if hangs else 120.0, "max_restarts": 1}
+    one = engine(env=HARD, launch=launch, inference={"workers": 1 + hangs})
+    name = "inference 1" if hangs else "inference"
     until_training(one)
     pid = one.pids()[name]
     one.plan(evaluation_plans(("match",), 24, "during"))
-    lose(one, pid)
+    os.kill(pid, signal.SIGSTOP) if hangs else fail(one)
     results: list[EpisodeResult] = []
     versions: list[int] = []
     back = None
@@ -162,20 +136,16 @@ def test_an_inference_replica_that_is_lost_is_replaced_alone(engine, lose: Any, 
         if back is None and progress.inference["restarts"]:
             back = progress.version
             one.plan(evaluation_plans(("match",), 8, "later"))
-        finished = sum(r.plan.group == "later" for r in results) == 8
-        if back is not None and progress.version > back and finished:
+        if back is not None and progress.version > back and len(indices(results, "later")) == 8:
             break
     assert versions == sorted(versions)
-    for group, count in (("during", 24), ("later", 8)):
-        assert sorted(r.plan.index for r in results if r.plan.group == group) == list(range(count))
-    later = [r.versions for r in results if r.plan.group == "later"]
-    assert min(old for old, _ in later) >= versions[0], "it came back with weights of its time"
-    explored = [r.plan.seed for r in results if r.plan.explore]
-    assert len(set(explored)) == len(explored)
+    assert indices(results, "during") == list(range(24)) and indices(results, "later") == list(range(8))
+    oldest = min(r.versions[0] for r in results if r.plan.group == "later")
+    assert oldest >= versions[0], "it came back with weights of its time"
     assert progress.rollout["restarts"] == 0.0 and progress.inference["restarts"] == 1.0
     assert one.pids()[name] != pid and gone(pid)
-    if lose is fail:
-        fail(one, pid)
+    if not hangs:
+        fail(one)
         text = until_failure(one)
         assert text.startswith("inference worker failed for good after 1 restarts:")
         assert "the forward pass fell over" in text and "serve" in text
@@ -183,7 +153,7 @@ def test_an_inference_replica_that_is_lost_is_replaced_alone(engine, lose: Any, 
 
 @pytest.mark.slow
 def test_a_full_disk_is_survived_and_a_trainer_that_hangs_while_it_is_saved_is_not(engine, tmp_path: Path):
-    one = engine(trainer=ENDLESS, launch=LaunchConfig(stall_s=5.0))
+    one = engine(launch={"stall_s": 5.0})
     with pytest.raises(RuntimeError, match=r"trainer worker failed in write(.|\n)*no space left"):
         one.save(tmp_path / FULL)
     until_training(one)
@@ -193,8 +163,8 @@ def test_a_full_disk_is_survived_and_a_trainer_that_hangs_while_it_is_saved_is_n
 
 @pytest.mark.slow
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
-    endless, launch = LatencyConfig(max_steps=16, frame_ms=4e6), LaunchConfig(stall_s=5.0, max_restarts=0)
-    one = engine(env=endless, rollout=RolloutConfig(environments=1), launch=launch)
+    endless, launch = LatencyConfig(max_steps=16, frame_ms=4e6), {"stall_s": 5.0, "max_restarts": 0}
+    one = engine(env=endless, rollout={"environments": 1}, launch=launch)
     one.train()
     text = until_failure(one)
     assert text.startswith("rollout 0 worker failed for good:")
@@ -206,10 +176,10 @@ def test_a_run_in_which_nothing_moves_ends_but_not_while_resets_are_slow(engine)
     """A reset takes 0.45 s, and so does a decision, with which an episode ends: eight resets take 3.6 s."""
     one = engine(
         env=LatencyConfig(max_steps=4, frame_ms=450.0),
-        rollout=RolloutConfig(environments=8, segment_length=1),
-        replay=ReplayConfig(capacity=16, min_decisions=4, max_unlearned_decisions=4, samples_per_insert=1),
-        trainer=TrainerConfig(updates=1_000_000, batch_decisions=4),
-        launch=LaunchConfig(stall_s=3.0, max_restarts=0),
+        rollout={"environments": 8, "segment_length": 1},
+        replay={"capacity": 16, "min_decisions": 4, "max_unlearned_decisions": 4, "samples_per_insert": 1},
+        trainer={"updates": 1_000_000, "batch_decisions": 4},
+        launch={"stall_s": 3.0, "max_restarts": 0},
     )
     one.plan(evaluation_plans(("match",), 8, "before"))
     assert len(collect(one, "before", 8)) == 8
@@ -231,7 +201,7 @@ def test_an_inference_is_replaced_before_there_are_weights_but_must_start(engine
             note.write_text(starts + "x")
 
     monkeypatch.setattr(inference_worker, "InferenceWorker", StartsTwice)
-    one = engine(rollout=TWO, trainer=ENDLESS)
+    one = engine()
     one.plan(evaluation_plans(("match",), 4, "before"))
     os.kill(one.pids()["inference"], signal.SIGKILL)
     assert {r.versions for r in collect(one, "before", 4)} == {(0, 0)}

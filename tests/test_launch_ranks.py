@@ -11,25 +11,18 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.stopping import WorkerError
 from tests.runs import drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening
 
-UPDATES = 6
-TWO = TrainerConfig(
-    updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,
-    ranks=2, sharding="zero3",
-)  # fmt: skip
-
 
 @pytest.mark.slow
 def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoint: Path, tmp_path: Path):
-    config = tiny_run(tiny_checkpoint, trainer=TWO, launch=LaunchConfig(stall_s=25.0))
+    two = {"updates": 1000, "warmup_updates": 0, "value_warmup_updates": 1, "ranks": 2, "sharding": "zero3"}
+    config = tiny_run(tiny_checkpoint, trainer=two | {"probe_every": 3}, launch={"stall_s": 25.0})
     with closing(RayEngine(config, ("match",))) as engine:
         pids = engine.pids()
         engine.train()
@@ -38,7 +31,7 @@ def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoi
             updates += progress.updates
             served = int(progress.inference.get("version", 0.0))
             probes = [u["logprob/mismatch_max"] for u in updates if "logprob/mismatch_max" in u]
-            if progress.version >= UPDATES and served > 0 and len(probes) >= 2:
+            if progress.version >= 6 and served > 0 and len(probes) >= 2:
                 break
         saved, addresses = engine.save(tmp_path), set(listening())
         os.kill(pids["trainer rank 1"], signal.SIGSTOP)
@@ -52,8 +45,7 @@ def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoi
     assert [u["grad_norm"] > 0 for u in updates] == [False] + [True] * (len(updates) - 1)
     assert max(probes) <= 1e-4, "decisions were made by whole weights that had been in parts"
 
-    before = load_file(tiny_checkpoint / "model.safetensors")
-    after = load_file(tmp_path / PRETRAINED / "model.safetensors")
+    before, after = (load_file(p / "model.safetensors") for p in (tiny_checkpoint, tmp_path / PRETRAINED))
     assert {k: t.shape for k, t in after.items()} == {k: t.shape for k, t in before.items()}
     assert any(not torch.equal(after[k], before[k]) for k in before)
     trained = snapshot.load(tmp_path / TRAINING_STATE / WEIGHTS)

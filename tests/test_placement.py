@@ -7,60 +7,32 @@ from typing import Any
 import pytest
 import torch
 
-from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.ray_session import Placement
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.train import Run
-from accerl_lerobot.world_model.config import ImaginationConfig
-from tests.runs import tiny_run
-
-Nodes = list[dict[str, float]]
+from tests.runs import changed, tiny_run
 
 
-def cluster(*sizes: tuple[float, float], **resources: str) -> Nodes:
-    """Resources of nodes with so many CPUs and GPUs; ``n1="sim"`` gives the second one a resource."""
-    nodes = [{"CPU": cpus, "GPU": gpus, f"node:10.0.0.{i + 1}": 1.0} for i, (cpus, gpus) in enumerate(sizes)]
-    for name, resource in resources.items():
-        nodes[int(name[1:])][resource] = 1.0
+def cluster(*gpus: float, sim: int | None = None) -> list[dict[str, float]]:
+    """Resources of nodes with so many GPUs, of which the one numbered `sim` has a resource of that name."""
+    nodes = [{"CPU": 8.0, "GPU": count, f"node:10.0.0.{i + 1}": 1.0} for i, count in enumerate(gpus)]
+    if sim is not None:
+        nodes[sim]["sim"] = 1.0
     return nodes
 
 
-def run(
-    *,
-    ranks: int = 1,
-    services: int = 1,
-    rollouts: int = 2,
-    imagining: bool = False,
-    device: str = "auto",
-    **placement: str,
-) -> RunConfig:
-    """A run of so many workers, its roles placed as the other keywords say."""
-    return tiny_run(
-        Path("nowhere"),
-        policy=PolicyConfig(path="nowhere", device=device),
-        trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks),
-        inference=InferenceConfig(workers=services),
-        rollout=RolloutConfig(workers=max(rollouts, services), environments=1, segment_length=3),
-        imagination=ImaginationConfig(environments=2 if imagining else 0, path="nowhere"),
-        launch=LaunchConfig(address="auto", placement=placement),
-    )
+def run(device: str = "auto", **placement: str) -> RunConfig:
+    launch = {"address": "auto", "placement": placement}
+    return tiny_run(Path("nowhere"), policy={"device": device}, launch=launch)
 
 
-def gpus(nodes: Nodes, config: RunConfig) -> dict[str, float]:
-    """Share of a GPU of each role's workers."""
-    placement = Placement(config, nodes, "a" * 56)
-    roles = ("trainer", "inference", "world_model", "rollout", "replay")
-    return {role: round(placement.options(role)["num_gpus"], 6) for role in roles}
-
-
-@pytest.mark.parametrize(("count", "share"), [(0, 0.0), (1, 0.5), (2, 1.0)])
-def test_by_default_all_is_here_and_shares_the_gpus(count: float, share: float):
-    placement = Placement(run(), cluster((8, count), (64, 8)), "a" * 56)
+@pytest.mark.parametrize(
+    ("device", "count", "share"), [("auto", 0, 0.0), ("auto", 1, 0.5), ("auto", 2, 1.0), ("cpu", 2, 0.0)]
+)
+def test_by_default_all_is_here_and_shares_the_gpus(device: str, count: float, share: float):
+    placement = Placement(run(device), cluster(count, 8), "a" * 56)
     for role in ("trainer", "inference", "rollout", "replay"):
         options = placement.options(role)
         assert options["scheduling_strategy"].node_id == "a" * 56
@@ -68,14 +40,17 @@ def test_by_default_all_is_here_and_shares_the_gpus(count: float, share: float):
 
 
 def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
-    nodes = cluster((8, 2), (8, 1), (64, 0), (32, 0), n2="sim", n3="sim")
-    sites = {"world_model": "node:10.0.0.2", "rollout": "sim"}
-    config = run(ranks=2, services=2, rollouts=6, imagining=True, **sites)
-    assert gpus(nodes, config) == {
-        "trainer": 0.6, "inference": 0.4, "world_model": 0.0, "rollout": 0.0, "replay": 0.0
-    }  # fmt: skip
-    assert set(gpus(nodes, run(device="cpu")).values()) == {0.0}
+    nodes = cluster(2, 1, 0, sim=2)
+    config = changed(
+        run(world_model="node:10.0.0.2", rollout="sim"),
+        trainer={"ranks": 2},
+        inference={"workers": 2},
+        rollout={"workers": 6},
+        imagination={"environments": 2, "path": "nowhere"},
+    )
     placement = Placement(config, nodes, "a" * 56)
+    assert placement.options("trainer")["num_gpus"] == pytest.approx(0.6)
+    assert placement.options("world_model")["num_gpus"] == 0
     assert placement.options("rollout")["resources"].keys() == {"sim"}
     assert placement.rows() == [
         "2 trainer × 0.6 GPU on this node",
@@ -84,28 +59,26 @@ def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
         "6 rollout on nodes with sim",
         "1 replay on this node",
     ]
-    everywhere = Placement(run(inference="all"), nodes, "a" * 56)
-    assert everywhere.options("inference")["scheduling_strategy"] == "SPREAD"
-    assert everywhere.options("inference")["num_gpus"] == 1.0
+    everywhere = Placement(run(inference="all"), nodes, "a" * 56).options("inference")
+    assert (everywhere["scheduling_strategy"], everywhere["num_gpus"]) == ("SPREAD", 1.0)
 
 
-def test_a_resource_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(InputError, match=r"rollout='simulators': .*there are node:10\.0\.0\.1, .*, sim, or"):
-        Placement(run(rollout="simulators"), cluster((8, 0), (8, 0), n1="sim"))
-
-
-def test_cuda_is_not_looked_for_on_nodes_without():
-    with pytest.raises(InputError, match=r"policy\.device='cuda': there is no GPU on the nodes with sim"):
-        Placement(run(device="cuda", inference="sim"), cluster((8, 1), (8, 0), n1="sim"))
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (run(rollout="simulators"), r"rollout='simulators': .*there are node:10\.0\.0\.1, .*, sim, or"),
+        (run("cuda", inference="sim"), r"policy\.device='cuda': there is no GPU on the nodes with sim"),
+    ],
+)
+def test_what_is_not_there_is_refused(config: RunConfig, message: str):
+    with pytest.raises(InputError, match=message):
+        Placement(config, cluster(1, 0, sim=1), "a" * 56)
 
 
 @pytest.mark.parametrize(
     ("fields", "match"),
     [
-        (
-            {"address": "auto", "engine": "local"},
-            r"launch\.address='auto': launch\.engine=local is one process",
-        ),
+        ({"address": "auto", "engine": "local"}, r"launch\.address='auto': launch\.engine=local is one proc"),
         ({"placement": {"rollout": "all"}}, r"placement=.*a private Ray has one"),
     ],
 )
@@ -115,12 +88,8 @@ def test_a_cluster_that_is_none_is_refused_when_the_recipe_is_read(fields: dict[
 
 
 def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Not even with what comes before its workers."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    trainer = TrainerConfig(updates=1, batch_decisions=16, ranks=2)
-    config = tiny_run(Path("nowhere"), trainer=trainer, policy=PolicyConfig(path="nowhere"))
-    with pytest.raises(
-        InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without; use at most 1"
-    ):
+    config = tiny_run(Path("nowhere"), trainer={"ranks": 2}, policy={"device": "auto"})
+    with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
         Run(config, tmp_path, Console(), load=lambda policy: None).execute()
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

@@ -8,52 +8,39 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, patch
 
 import pytest
 import yaml
 
 from accerl_lerobot.algorithms import SelfImitationConfig
-from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.cli import main
 from accerl_lerobot.demos import sft
-from accerl_lerobot.demos.record import DemosConfig
-from accerl_lerobot.engines.config import LaunchConfig, RunConfig, decode, encode
+from accerl_lerobot.engines.config import RunConfig, decode, encode
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError, check_absent
-from accerl_lerobot.evaluation import EvaluationConfig
-from accerl_lerobot.policies.config import GaussianSamplerConfig, PolicyConfig
-from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import preflight, resuming
 from accerl_lerobot.run.resuming import resume_command
 from accerl_lerobot.run.train import Run
-from tests.policies.checkpoints import write_policy
+from tests.policies.checkpoints import write_smolvla
+from tests.runs import changed, eventually, tiny_run
 from tests.runs import records as logged
-from tests.runs import tiny_run
+from tests.test_run import local_run
 from tests.tiny_datasets import one_process
 
-UPDATES = 14
 TIMES = ("wall_s", "wait_s", "update_s", "publish_s", "rl_s", "warm_start_s")
 
 
-def recipe(folder: Path, checkpoint: Path, **sections: Any) -> Path:
-    defaults: dict[str, Any] = {
-        "env": SimulatedConfig(max_steps=12, tolerance=0.4),
-        "evaluation": EvaluationConfig(episodes=6, every_updates=4, episodes_during=5, videos=1),
-        "trainer": TrainerConfig(
-            updates=UPDATES, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2
-        ),
-        "launch": LaunchConfig(engine="local"),
-        "save_every_updates": 5,
-    }
-    config = tiny_run(checkpoint, **{**defaults, **sections})
-    folder.mkdir(exist_ok=True)
-    (folder / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
-    return folder / "recipe.yaml"
+def train(folder: Path, checkpoint: Path, **sections: Any) -> int:
+    """Begins a run in `folder`, from a recipe; the exit code."""
+    evaluation = {"episodes": 6, "episodes_during": 5}
+    config = local_run(checkpoint, folder, evaluation=evaluation, trainer={"updates": 14, "lr": 1e-3})
+    recipe = folder.with_suffix(".yaml")
+    recipe.write_text(yaml.safe_dump(encode(changed(config, **sections))))
+    return main(["train", str(recipe)])
 
 
 def records(run: Path) -> list[dict[str, Any]]:
@@ -67,7 +54,6 @@ def summary(run: Path) -> dict[str, Any]:
 
 
 def files(run: Path) -> list[bytes]:
-    """Weights and journal."""
     last = run / "checkpoints" / "last" / "pretrained_model"
     paths = [last / "model.safetensors", last / "value_head.safetensors", run / "episodes.jsonl"]
     return [path.read_bytes() for path in paths]
@@ -75,47 +61,46 @@ def files(run: Path) -> list[bytes]:
 
 @pytest.fixture(scope="module")
 def whole(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that was never stopped."""
     folder = tmp_path_factory.mktemp("whole")
-    assert main(["train", str(recipe(folder, tiny_checkpoint)), f"--output_dir={folder / 'run'}"]) == 0
+    assert train(folder / "run", tiny_checkpoint) == 0
     return folder / "run"
 
 
-def stop_at(monkeypatch: pytest.MonkeyPatch, version: int, number: int = signal.SIGTERM) -> None:
-    """This process gets a signal once so many updates have been made."""
+def at(version: int, happens: Callable[[], Any]) -> Any:
+    """Something happens once so many updates have been made."""
     poll = LocalEngine.poll
 
     def watched(self: LocalEngine) -> Any:
         progress = poll(self)
         if progress.version == version and progress.updates:
-            os.kill(os.getpid(), number)
+            happens()
         return progress
 
-    monkeypatch.setattr(LocalEngine, "poll", watched)
+    return patch.object(LocalEngine, "poll", watched)
 
 
 def go_on(run: Path, *arguments: str, config: str = "config.yaml") -> int:
     return main(["train", "--resume=true", f"--config_path={run / config}", *arguments])
 
 
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
-)
-def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
-    number: int, code: int, whole: Path, tiny_checkpoint: Path, tmp_path: Path, monkeypatch, capsys
-):
+def equal(run: Path, other: Path) -> bool:
+    return all(of(run) == of(other) for of in (records, summary, files))
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(whole, tiny_checkpoint, tmp_path, capsys):
     run = tmp_path / "run"
-    with monkeypatch.context() as context:
-        stop_at(context, 7, number)
-        assert main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"]) == code
+    with at(7, lambda: os.kill(os.getpid(), signal.SIGTERM)):
+        assert train(run, tiny_checkpoint) == 143
     said = " ".join(capsys.readouterr().err.split())
-    assert f"stopped by {signal.Signals(number).name}; to resume: accerl train --resume=true" in said
+    assert "stopped by SIGTERM; to resume: accerl train --resume=true" in said
     assert not (run / "summary.json").exists()
     assert sorted(p.name for p in (run / "checkpoints").iterdir()) == ["000000", "000005", "000007", "last"]
     assert go_on(run, config="checkpoints/last/config.yaml") == 0
-    assert records(run) == records(whole)
-    assert summary(run) == summary(whole)
-    assert files(run) == files(whole)
+    assert equal(run, whole)
     assert (run / "before_after.mp4").is_file() and not list(run.glob(".before*"))
 
 
@@ -127,68 +112,46 @@ def test_a_run_that_another_process_has_resumed_is_left_alone(whole: Path, capsy
 
 @pytest.mark.slow
 def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path, monkeypatch, capsys):
-    """And they begin the memory of an off-policy algorithm."""
     run = tmp_path / "run"
-    small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "dim_model": 8, "n_heads": 1}
-    small |= {"n_encoder_layers": 1, "n_vae_encoder_layers": 1, "dim_feedforward": 8, "latent_dim": 2}
-    small |= {"pretrained_backbone_weights": None}
     sections: dict[str, Any] = {
-        "env": SimulatedConfig(max_steps=16, tolerance=0.4, environment_state=True),
-        "demos": DemosConfig(episodes=3),
-        "sft": sft.SFTConfig(steps=2, batch_size=2, policy=small),
-        "policy": PolicyConfig(device="cpu", sampler=GaussianSamplerConfig(std=0.3)),
+        "demos": {"episodes": 3},
+        "sft": {"steps": 2, "policy": {"type": "smolvla", "chunk_size": 4, "n_action_steps": 4}},
+        "policy": {"path": None},
         "algorithm": SelfImitationConfig(),
-        "replay": ReplayConfig(
-            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
-        ),
-        "rollout": RolloutConfig(environments=4, segment_length=4),
-        "trainer": TrainerConfig(updates=3, batch_decisions=16, warmup_updates=0, value_warmup_updates=0),
-        "evaluation": EvaluationConfig(episodes=2, videos=0),
+        "replay": {"samples_per_insert": 1},
+        "rollout": {"segment_length": 4},
+        "trainer": {"updates": 3},
+        "evaluation": {"episodes": 2, "every_updates": 0, "videos": 0},
     }
 
     def trained(config: sft.SFTConfig, dataset: Any, output_dir: Path, *rest: Any, **fields: Any) -> Path:
         check_absent(output_dir)
-        options = dict(small)
-        return write_policy(output_dir / "pretrained_model", options.pop("type"), image=32, **options)
+        return write_smolvla(output_dir / "pretrained_model")
 
     def falls(*arguments: Any, **fields: Any) -> Path:
         trained(*arguments, **fields)
         raise ArithmeticError("it fell over")
 
     monkeypatch.setattr(sft, "run_sft", trained)
-    with monkeypatch.context() as context, one_process():
-        context.setattr(sft, "run_sft", falls)
-        assert main(["train", str(recipe(tmp_path, Path("x"), **sections)), f"--output_dir={run}"]) == 1
+    with patch.object(sft, "run_sft", falls), one_process():
+        assert train(run, Path("x"), **sections) == 1
     assert "to resume: accerl train --resume=true" in " ".join(capsys.readouterr().err.split())
-    made = (run / "demos" / "meta" / "info.json").stat().st_mtime_ns
+    made = tree(run / "demos")
     assert go_on(run) == 0
     assert "there is no checkpoint yet" in capsys.readouterr().err
-    assert (run / "demos" / "meta" / "info.json").stat().st_mtime_ns == made, "they were not recorded again"
-    begun = run / json.loads((run / "warm_start.json").read_text())["policy"]
-    assert (begun / "model.safetensors").is_file()
+    assert tree(run / "demos") == made, "they were not recorded again"
     first, *_, last = [r for r in records(run) if r["kind"] == "train"]
     assert first["memory_decisions"] >= first["decisions"] + 3 * 4  # each is read from four steps on
     assert last["memory_decisions"] > first["memory_decisions"]
     assert summary(run)["updates"] == 3
 
 
-def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
-    whole: Path, tiny_checkpoint: Path, tmp_path: Path, monkeypatch, capsys
-):
+def test_a_run_that_fell_over_goes_on_from_its_last_whole_one(whole, tiny_checkpoint, tmp_path, capsys):
     run = tmp_path / "run"
-    poll = LocalEngine.poll
-
-    def falls(self: LocalEngine) -> Any:
-        progress = poll(self)
-        if progress.version == 12:
-            raise ArithmeticError("it fell over")
-        return progress
-
-    with monkeypatch.context() as context:
-        context.setattr(LocalEngine, "poll", falls)
-        assert main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"]) == 1
+    with at(12, Mock(side_effect=ArithmeticError("it fell over"))):
+        assert train(run, tiny_checkpoint) == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "failed; to resume: accerl train --resume=true" in said
+    assert f"failed; to resume: accerl train --resume=true --config_path={run}/config.yaml" in said
     assert f"accerl: ArithmeticError: it fell over; the traceback is in {run / 'error.log'}" in said
     assert "ArithmeticError: it fell over" in (run / "error.log").read_text()
     newest = run / "checkpoints" / "000010" / "training_state" / "replay.safetensors"
@@ -199,52 +162,46 @@ def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
     said = " ".join(capsys.readouterr().err.split())
     assert "passed over checkpoint 000010: training_state/replay.safetensors is not what was written" in said
     assert "going on from" in said and "000005" in said
-    assert records(run) == records(whole) and summary(run) == summary(whole) and files(run) == files(whole)
+    assert equal(run, whole)
 
 
-def test_more_updates_may_be_asked_for_and_nothing_else(whole: Path, capsys: pytest.CaptureFixture[str]):
-    assert go_on(whole) == 2
-    assert "trainer.updates=14: the run" in capsys.readouterr().err
-    assert go_on(whole, "--trainer.lr=0.1", "--trainer.updates=20") == 2
-    assert "trainer.lr=0.1: the run was begun with 0.001; leave it so" in capsys.readouterr().err
-    before = {path: path.read_bytes() for path in whole.rglob("*") if path.is_file()}
-    for change in ("--env.type=metaworld", "--launch.engine=ray"):
-        assert go_on(whole, change) == 2
-    assert "launch.engine='ray': the run was begun with 'local'" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in whole.rglob("*") if path.is_file()} == before
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ([], "trainer.updates=14: the run"),
+        (["--trainer.lr=0.1", "--trainer.updates=20"], "trainer.lr=0.1: the run was begun with 0.001; leave"),
+        (["--env.max_steps=9"], "env.max_steps=9: the run was begun with 12"),
+        (["--launch.engine=ray"], "launch.engine='ray': the run was begun with 'local'"),
+    ],
+)
+def test_more_updates_may_be_asked_for_and_nothing_else(changes, message, whole: Path, capsys):
+    before = tree(whole)
+    assert go_on(whole, *changes) == 2
+    assert message in capsys.readouterr().err and tree(whole) == before
 
 
-def failing(*_: object) -> None:
-    raise InputError("env.type", "simulated", "it is gone")
-
-
-def test_a_finished_run_goes_back_to_an_earlier_checkpoint(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_finished_run_goes_back_to_an_earlier_checkpoint(whole: Path, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(whole, run, symlinks=True)
     (run / "wandb").mkdir()
     (run / "wandb" / "debug-core.log").symlink_to(tmp_path / "elsewhere")  # as its client does
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    monkeypatch.setattr(preflight, "check_environment", failing)
-    assert go_on(run, config="checkpoints/000010/config.yaml") == 2
-    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
-    monkeypatch.undo()
-    monkeypatch.setattr(Run, "_practise_with_engine", failing)
-    assert go_on(run, config="checkpoints/000010/config.yaml") == 2
+    before = tree(run)
+    gone = Mock(side_effect=InputError("env.type", "simulated", "it is gone"))
+    with patch.object(preflight, "check_environment", gone):
+        assert go_on(run, config="checkpoints/000010/config.yaml") == 2
+    assert tree(run) == before
+    with patch.object(Run, "_practise_with_engine", gone):
+        assert go_on(run, config="checkpoints/000010/config.yaml") == 2
     assert not (run / "summary.json").exists(), "it tells of the end that was given up"
-    monkeypatch.undo()
     assert go_on(run) == 0
     assert records(run) == records(whole) and summary(run) == summary(whole)
 
 
-def test_what_is_no_run_is_refused(
-    tiny_checkpoint: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_what_is_no_run_is_refused(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["train", "--resume=true"]) == 2
     assert "resume=True: add --config_path: name RUN/config.yaml" in capsys.readouterr().err
-    path = recipe(tmp_path, tiny_checkpoint)
-    assert main(["train", "--resume=true", f"--config_path={path}"]) == 2
+    shutil.copy(whole / "config.yaml", tmp_path)
+    assert go_on(tmp_path) == 2
     assert "no run has been begun there" in capsys.readouterr().err
     assert go_on(whole, config="checkpoints/000003/config.yaml") == 2
     assert "no such file" in capsys.readouterr().err
@@ -258,7 +215,7 @@ def test_what_is_no_run_is_refused(
     ],
 )
 def test_a_damaged_or_hostile_run_is_refused_before_anything_is_written(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, text: str | None, why: str
+    name: str, text: str | None, why: str, whole: Path, tmp_path: Path, capsys
 ):
     run, outside = tmp_path / "run", tmp_path / "outside"
     shutil.copytree(whole, run, symlinks=True)
@@ -267,38 +224,33 @@ def test_a_damaged_or_hostile_run_is_refused_before_anything_is_written(
         (run / name).symlink_to(outside)
     else:
         (run / name).write_text(text)
-    before = sorted((path, path.stat().st_mtime_ns) for path in tmp_path.rglob("*"))
+    before = tree(tmp_path)
     assert go_on(run, "--trainer.updates=20") == 2
     error = capsys.readouterr().err
     assert f"{name}: " in error and why in error and error.count("\n") == 1
-    assert sorted((path, path.stat().st_mtime_ns) for path in tmp_path.rglob("*")) == before
+    assert tree(tmp_path) == before
 
 
 @pytest.mark.slow
 def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint: Path, tmp_path: Path):
-    """All of it real, in processes of their own, of which the first gets SIGKILL and the second SIGTERM."""
-    run = tmp_path / "run"
-    path = recipe(
-        tmp_path,
+    run, path, log = tmp_path / "run", tmp_path / "recipe.yaml", tmp_path / "log"
+    config = tiny_run(
         tiny_checkpoint,
-        launch=LaunchConfig(stall_s=120),
-        env=SimulatedConfig(max_steps=12, tolerance=0.4),
-        rollout=RolloutConfig(workers=2, environments=2, segment_length=3),
-        trainer=TrainerConfig(updates=120, batch_decisions=16, lr=1e-3),
+        env={"max_steps": 12, "tolerance": 0.4},
+        rollout={"workers": 2, "environments": 2},
+        trainer={"updates": 120, "lr": 1e-3},
         save_every_updates=3,
     )
+    path.write_text(yaml.safe_dump(encode(config)))
     command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
-    log = tmp_path / "log"
     again = [*command, "--resume=true", f"--config_path={run / 'config.yaml'}"]
 
     def until(least: int, arguments: list[str], number: int) -> int:
         """Starts it, waits for a checkpoint of so many updates, and sends a signal; its exit code."""
         with log.open("wb") as out:
             process = subprocess.Popen(arguments, stdout=out, stderr=out)
-            deadline = time.monotonic() + 240
-            while not any(int(p.name) >= least for p in (run / "checkpoints").glob("0*")):
-                assert process.poll() is None and time.monotonic() < deadline, log.read_text()
-                time.sleep(0.02)
+            saved = (run / "checkpoints").glob
+            assert eventually(lambda: any(int(p.name) >= least for p in saved("0*")), 240), log.read_text()
             process.send_signal(number)
             return process.wait(60)
 
@@ -315,9 +267,7 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
     assert found["updates"] == 120 and found["n_before"] == found["n_after"] == 6
     evaluations = [r["group"] for r in records(run) if r["kind"] == "evaluation"]
     assert len(set(evaluations)) == len(evaluations) and {"before", "after"} <= set(evaluations)
-    assert max(r["lag_max"] for r in train) == found["lag_max"] < 40
-    steps = [r["env_steps"] for r in records(run) if r["kind"] == "rollout"]
-    assert steps == sorted(steps)
+    assert found["lag_max"] < 40
 
 
 def test_a_run_says_what_the_command_line_has_to_allow_again(tmp_path: Path):

@@ -1,60 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An asynchronous run that is gone on with: nothing that was committed is lost, doubled or learnt from twice.
-
-Inference and trainer are stand-ins that start at once, and the trainer writes down what it was given; rollout
-and replay are real. The run with everything real is in ``test_resume.py``.
-"""
+"""An asynchronous run that is gone on with; its trainer is a stand-in that writes down what it was given."""
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
-
-from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engines import Progress
-from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.supervision import RolloutSlot, restore_rollouts, save_rollouts
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import EpisodePlan, RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlan
 from benchmarks.simulated_environment import LatencyConfig
 from tests.rollout.environments import ended
-from tests.runs import drive, tiny_run, until
+from tests.runs import drive, tiny_run, until, updates
 
 UPDATES, DURING = 40, 12
-TWO = RolloutConfig(workers=2, environments=2, segment_length=3)
 
 
-@pytest.fixture
-def engine(light_engine: Callable[..., RayEngine]) -> Callable[..., RayEngine]:
-    defaults: dict[str, Any] = {
+def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(light_engine, tmp_path: Path):
+    sections: dict[str, Any] = {
         "env": LatencyConfig(max_steps=16, frame_ms=4.0),
-        "rollout": TWO,
-        "replay": ReplayConfig(
-            capacity=160, min_decisions=16, max_unlearned_decisions=48, samples_per_insert=2.0, max_lag=40
-        ),
-        "trainer": TrainerConfig(updates=UPDATES, batch_decisions=16),
+        "rollout": {"workers": 2, "environments": 2},
+        "replay": {"capacity": 160, "max_unlearned_decisions": 48, "max_lag": 40},
+        "trainer": {"updates": UPDATES},
     }
-    return lambda state=None, **sections: light_engine(state, **{**defaults, **sections})
-
-
-def updates(history: list[Progress]) -> list[float]:
-    return [u["update"] for p in history for u in p.updates]
-
-
-def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, tmp_path: Path):
-    first = engine()
+    first = light_engine(**sections)
     first.plan(evaluation_plans(("match",), DURING, "during"))
     first.train()
     history = until(first, 14)
     saved = first.save(tmp_path)
-    assert updates(history) + [u["update"] for u in saved.updates] == [i + 1.0 for i in range(saved.version)]
+    assert [u["update"] for u in updates([*history, saved])] == [i + 1.0 for i in range(saved.version)]
     counters = first.poll().rollout
     until(first, saved.version + 6)  # what comes after the checkpoint is to be forgotten
     first.close()
@@ -68,14 +44,13 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
     assert len(held) == len(cut["entries"]) > 0
     assert all(entry["uses"] == uses[key] for key, entry in held.items()), "as many as it had learnt from"
 
-    second = engine(state)
+    second = light_engine(state, **sections)
     second.train()
     after = drive(second)
-    assert updates(after) == [i + 1.0 for i in range(saved.version, UPDATES)]
-    whole = second._trainer.call("hold")[0]
-    second._trainer.call("write", tmp_path / "end")
+    assert [u["update"] for u in updates(after)] == [i + 1.0 for i in range(saved.version, UPDATES)]
+    second.save(tmp_path / "end")
     ledger = snapshot.load(tmp_path / "end" / TRAINING_STATE / "trainer")["ledger"]
-    assert whole == len(ledger) == UPDATES
+    assert len(ledger) == UPDATES
     uses = Counter(key for keys in ledger for key in keys)
     assert all(uses[key] <= entry["draws"] for key, entry in held.items())
     incarnations = {key.rsplit(".", 1)[0] for keys in ledger[saved.version :] for key in keys}
@@ -92,25 +67,16 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
 
 def test_the_rollout_workers_part_of_a_checkpoint(tmp_path: Path):
     """Episodes that were paid for are played once; planned ones without a result are played again."""
-
-    def slots() -> list[RolloutSlot]:
-        config = tiny_run(Path("nowhere"), rollout=replace(TWO, episodes=41))
-        return [RolloutSlot(i, None, config, ("match",)) for i in range(config.rollout.workers)]
-
-    def report(*plans: EpisodePlan) -> Any:
-        return SimpleNamespace(episodes=[ended(plan) for plan in plans])
-
-    first = slots()
+    config = tiny_run(Path("nowhere"), rollout={"workers": 2, "episodes": 41})
+    first, second = ([RolloutSlot(i, None, config, ("match",)) for i in range(2)] for _ in range(2))
     planned = evaluation_plans(("match",), 4, "during")
     explored = EpisodePlan(task="match", seed=7, explore=True)
     for slot in first:
         slot.assign(planned[slot.index :: 2])
-    assert len(first[0].take(report(explored, explored, planned[0]))) == 3
-    assert first[0].take(report(planned[0])) == [], "it was reported before"
+    report: Any = SimpleNamespace(episodes=[ended(plan) for plan in (explored, explored, planned[0])])
+    first[0].take(report)
     save_rollouts(tmp_path, first)
-    second = slots()
     restore_rollouts(tmp_path, second)
     assert [slot.budget for slot in second] == [19, 20]
     assert [sorted(slot.outstanding) for slot in second] == [[("during", 2)], [("during", 1), ("during", 3)]]
-    assert [slot.incarnation for slot in second] == [1, 1], "keys are new, and so are the seeds"
     assert second[0].begun == [("match", 7), ("match", 7)]

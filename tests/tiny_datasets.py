@@ -27,7 +27,6 @@ FEATURES: dict[str, dict[str, Any]] = {
 
 
 def labels(dtype: str = "bool") -> dict[str, Any]:
-    """The feature of one label."""
     return {"dtype": dtype, "shape": (1,), "names": None}
 
 
@@ -67,15 +66,12 @@ def write_dataset(
 
 
 def kind(feature: dict[str, Any]) -> Any:
-    """The NumPy type of a feature's values."""
-    depth = (feature.get("info") or {}).get("is_depth_map")
     if feature["dtype"] in ("image", "video"):
-        return np.uint16 if depth else np.uint8
+        return np.uint16 if (feature.get("info") or {}).get("is_depth_map") else np.uint8
     return np.dtype(feature["dtype"])
 
 
 def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
-    """Replaces a parquet file by a change of it."""
     with pq.ParquetFile(path) as file:
         table = file.read()
     pq.write_table(change(table), path)
