@@ -104,7 +104,7 @@ def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
     outside = {"files": manifest["files"] | {"../../outside": {"size": 1, "sha256": "0"}}}
     for change, weights, why in (
         ({}, "WEIGHTS", "000003: pretrained_model/model.safetensors is not what was"),
-        ({"format": 9}, "weights", "its format is 9, and this accerl reads 7"),
+        ({"format": 0}, "weights", f"its format is 0, and this accerl reads {layout.FORMAT}"),
         (outside, "weights", r"json is broken \(.*\./outside: it leads out of the"),
     ):
         (path / "manifest.json").write_text(json.dumps(manifest | change))
