@@ -24,7 +24,7 @@ pytest.importorskip("libero", reason="LIBERO is not installed")
     [
         ("libero_object/1", 5),
         pytest.param("libero_spatial/7", 5, marks=pytest.mark.slow),
-        pytest.param("libero_goal/7", eval_seed(0, 0), marks=pytest.mark.slow),
+        pytest.param("libero_goal/3", eval_seed(0, 0), marks=pytest.mark.slow),
         pytest.param("libero_10/9", 5, marks=pytest.mark.slow),
     ],
 )
@@ -46,9 +46,8 @@ def test_plans_hold_the_goals_of_their_tasks_and_have_a_skill_for_every_step(sui
         assert all(step[0] in SKILLS or step[-1] in SKILLS for step in plan)
 
 
-@pytest.mark.parametrize("task", ["libero_90/0", "libero_goal"])
-def test_a_task_without_an_expert_is_refused_before_any_work(task: str, tmp_path: Path):
+def test_a_task_without_an_expert_is_refused_before_any_work(tmp_path: Path):
     with pytest.raises(InputError, match="libero_object, libero_spatial, libero_goal, libero_10") as caught:
-        record_demos(LiberoConfig(task=task), DemosConfig(), str(tmp_path / "demos"))
+        record_demos(LiberoConfig(task="libero_90/0"), DemosConfig(), str(tmp_path / "demos"))
     assert caught.value.field == "env.task" and "\n" not in str(caught.value)
     assert not (tmp_path / "demos").exists()
