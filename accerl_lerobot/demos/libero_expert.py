@@ -55,6 +55,7 @@ DOOR = (0.2, 0.06)  # point on a microwave's door: distance from its hinge, and 
 KNOB = 0.038  # height of the grasp above the origin of the stove's knob
 PRESS = 0.008  # height of the fingers above a plate's origin while they push it
 WIDEST = 0.068  # widest object that fits between the open fingers with some room, in m
+RIM = 0.012  # distance of the grip site from the outside of a rim, in m
 DEPTH = 0.015  # distance of the grip site below an object's top; the palm is 2.4 cm above the grip site
 MARGIN = 0.004  # distance at which a point counts as inside an object, in m
 CLEARANCE = 0.08  # distance of objects beside the hand's way that it rises above, in m
@@ -178,7 +179,7 @@ class Scene:
             at_end = cost + 0.5
             cost = np.concatenate([cost, at_end, at_end])
         else:
-            to_rim = across * (width / 2 - 0.012)[:, None]
+            to_rim = across * (width / 2 - RIM)[:, None]
             offsets = np.concatenate([to_rim, -to_rim])
             cost = np.repeat([1.0, 0.0], len(across))  # the side of −y, if it is free
         points = (flat.min(0) + flat.max(0)) / 2 + offsets
@@ -200,7 +201,7 @@ class Scene:
         corners = self.corners(name).reshape(-1, 3)
         low = corners.min(0)
         high = corners.max(0)
-        rim = np.array([(low[0] + high[0]) / 2, high[1] - 0.012, high[2] - DEPTH])
+        rim = np.array([(low[0] + high[0]) / 2, high[1] - RIM, high[2] - DEPTH])
         return Grasp(rim - self.simulator.position(name), 0.0, 0.5)
 
 

@@ -136,14 +136,15 @@ def test_state_has_all_that_a_task_is_about(task: str, opening: tuple[str, ...])
         assert np.abs(state - number).min() < 1e-6
 
 
-RECORDED, DRAWN = eval_seed(0, 57), train_seed(0, 0, 7)
+RECORDED, DRAWN = eval_seed(0, 7), train_seed(0, 0, 7)
 SLOW = [
     # LIBERO draws the opening of spatial/4's drawer once more for each reset that it has made before.
     ("libero_spatial/4", RECORDED, "stock"), ("libero_goal/3", DRAWN, "stock"),
     ("libero_10/2", DRAWN, "stock"), ("libero_90/20", RECORDED, "stock"),
     ("libero_goal/8", RECORDED, "fast"),
 ]  # fmt: skip
-QUICK = [("libero_object/0", RECORDED, "stock"), ("libero_object/0", DRAWN, "fast")]
+# There are 50 recorded starts.
+QUICK = [("libero_object/0", eval_seed(0, 57), "stock"), ("libero_object/0", DRAWN, "fast")]
 
 
 @needs_assets
@@ -170,9 +171,8 @@ def test_physics_are_liberos(task: str, seed: int, rendering: Any):
         if action is not None:
             stock.step(action)
             assert simulator.step(action)[0] == stock.check_success()
-        # Contacts make more of what the order of sums rounds.
-        assert np.abs(theirs.qpos - ours.qpos).max() < 1e-7
-        assert np.abs(theirs.qvel - ours.qvel).max() < 1e-5
+        assert np.abs(theirs.qpos - ours.qpos).max() < 1e-9
+        assert np.abs(theirs.qvel - ours.qvel).max() < 1e-6
     stock.close()
     simulator.close()
 
