@@ -34,6 +34,7 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 FPS = 20  # control rate of environments that name none
 MAX_STEPS = 500  # episode limit of environments that have none
 LIMIT = "_max_episode_steps"  # attribute of an environment or a wrapper of it, where LeRobot reads the limit
+LENGTH = "episode_length"  # field of LeRobot's configs of environments for the limit
 RENDER = "render"  # in `GymConfig.images`: the picture that the environment renders
 RETURNS = {
     "reset": ("observation", "info"),
@@ -295,14 +296,17 @@ class LeRobotEnvironment(GymnasiumEnvironment):
                 raise InputError("env.name", config.name, hint)
         kind = LeRobotConfig.get_choice_class(config.name)
         names = kind.__dataclass_fields__
+        self._fields = f"LeRobot's {config.name} has the fields {', '.join(names)}"
         settings = dict(config.kwargs)
-        if config.max_steps and "episode_length" in names:
-            settings["episode_length"] = config.max_steps
+        if config.max_steps and LENGTH in names:
+            if LENGTH in settings:
+                hint = f"env.max_steps={config.max_steps} sets it; give one of the two"
+                raise InputError(f"env.kwargs.{LENGTH}", settings[LENGTH], hint)
+            settings[LENGTH] = config.max_steps
         try:
             self._settings = kind(**settings)
         except (TypeError, ValueError) as error:
-            hint = f"{error}; LeRobot's {config.name} has the fields {', '.join(names)}"
-            raise InputError("env.kwargs", config.kwargs, hint) from error
+            raise InputError("env.kwargs", config.kwargs, f"{error}; {self._fields}") from error
         _check_hub(config, getattr(self._settings, "hub_path", None))
         self._before, self._after = self._settings.get_env_processors()
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
@@ -339,8 +343,11 @@ class LeRobotEnvironment(GymnasiumEnvironment):
         batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
         images = [key for key in batch if key.startswith(_IMAGE)]
         if _STATE not in batch or not images:
-            hint = f"a policy needs images and a state, {self.config.name} shows {', '.join(batch)}"
-            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; use obs_type=pixels_agent_pos")
+            shown = ", ".join(key for key in batch if key.startswith("observation."))
+            hint = f"a policy needs images and a state, and this environment shows {shown or 'neither'}"
+            with_both = "use obs_type=pixels_agent_pos"
+            advice = with_both if hasattr(self._settings, "obs_type") else self._fields
+            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; {advice}")
         observation: Observation = {TASK: text, _STATE: batch[_STATE][0].numpy().astype(np.float32)}
         for key in images:
             name = key

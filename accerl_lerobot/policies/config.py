@@ -212,15 +212,21 @@ def register_policies(wanted: str | None = None) -> None:
 
 
 def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
-    """Refuses a policy type that neither LeRobot nor an installed package has, after `register_policies`."""
+    """Refuses a policy type that neither LeRobot nor an installed package has, after `register_policies`.
+
+    A package that fails may have registered its type before, and is refused as well.
+    """
     from lerobot.configs.policies import PreTrainedConfig
 
-    known = sorted(PreTrainedConfig.get_known_choices())
+    known = PreTrainedConfig.get_known_choices()
     if policy_type not in known:
         install = "install the package that has it, or name it: policy.discover_packages_path"
         broken = "; ".join(NOT_IMPORTED.values())
-        why = f"no such policy type here; {broken or install}; there are {', '.join(known)}"
+        why = f"no such policy type here; {broken or install}; there are {', '.join(sorted(known))}"
         raise InputError(field, policy_type, prefix + why)
+    package = known[policy_type].__module__.partition(".")[0]
+    if package in NOT_IMPORTED:
+        raise InputError(field, policy_type, prefix + NOT_IMPORTED[package])
 
 
 def discovery(policy_type: str | None) -> list[str]:

@@ -48,6 +48,7 @@ def test_images_and_states_are_lerobot_s():
         ({"name": "nope"}, "env.name='nope': LeRobot has: .*pusht"),
         ({"kwargs": {"colour": 1}}, "env.kwargs=.*colour.*pusht has the fields .*obs_type"),
         ({"kwargs": {"obs_type": "environment_state_agent_pos"}}, "pixels_agent_pos"),
+        ({"kwargs": {"episode_length": 20}, "max_steps": 12}, "episode_length=20: env.max_steps=12"),
     ],
 )
 def test_bad_values_name_field_and_remedy(values: dict, message: str):

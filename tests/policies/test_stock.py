@@ -326,19 +326,35 @@ def test_in_python_an_episode_begins_with_reset(vqbet: Path):
     np.testing.assert_array_equal(policy.act(first), expected.chunk)
 
 
-def test_a_type_that_is_missing_and_a_package_that_is_broken_are_two_lines(tmp_path: Path, monkeypatch: Any):
+REGISTERS = """
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.act.configuration_act import ACTConfig
+
+@PreTrainedConfig.register_subclass("theirs")
+class TheirConfig(ACTConfig):
+    pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "said"), [("", "no such policy type here; "), (REGISTERS, "of this type: ")]
+)
+def test_a_type_that_is_missing_and_a_package_that_is_broken_are_two_lines(
+    before: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(policies, "NOT_IMPORTED", {})
+    monkeypatch.setattr(PreTrainedConfig, "_choice_registry", dict(PreTrainedConfig.get_known_choices()))
     (tmp_path / "config.json").write_text('{"type": "theirs"}')
     save_file({"weight": torch.zeros(1)}, tmp_path / "model.safetensors")
     with pytest.raises(InputError, match="no such policy type here; install the package.*; there are act, "):
         acting(tmp_path)
     name, info = "lerobot_policy_theirs", tmp_path / "lerobot_policy_theirs-1.0.dist-info"
-    (tmp_path / f"{name}.py").write_text("import no_such_module_of_theirs")
+    (tmp_path / f"{name}.py").write_text(f"{before}\nimport no_such_module_of_theirs")
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot-policy-theirs\nVersion: 1.0\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     why = f"{name} is installed and cannot be imported .ModuleNotFoundError: No module named"
-    with pytest.raises(InputError, match=f"no such policy type here; {why}") as caught:
+    with pytest.raises(InputError, match=f"{said}{why}") as caught:
         acting(tmp_path)
     assert "\n" not in str(caught.value) and name not in sys.modules
 
