@@ -149,7 +149,7 @@ def _recipe_on_base(path: Path, config_class: type[Any], above: tuple[Path, ...]
     below = path.parent / base
     if not below.is_file():
         below = expanded(base, BASE)
-    if below in (path, *above):
+    if below.resolve() in [recipe.resolve() for recipe in (path, *above)]:
         raise InputError(BASE, base, "this recipe is laid on itself; leave the line out")
     try:
         tree = _recipe_on_base(below, config_class, (*above, path))
