@@ -115,8 +115,8 @@ def sft_command(
         "scheduler_warmup_steps": WARMUP_STEPS,
         "scheduler_decay_steps": config.steps,
     }
+    policy = {name: value for name, value in preset.items() if name in known} | policy
     policy |= {"device": device, "push_to_hub": False}
-    policy |= {name: value for name, value in preset.items() if name in known}
     data = {
         "repo_id": dataset.repo_id,
         "root": local_folder(dataset),

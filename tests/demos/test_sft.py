@@ -158,6 +158,8 @@ def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set
     command = sft_command(SFTConfig(steps=9, policy={"type": kind}), HUB, tmp_path / "sft", 0, "cpu")
     assert {a for a in command if "scheduler" in a} == schedule
     assert not [a for a in command if "pretrained_backbone_weights" in a], "a new policy's own choice"
+    chosen = SFTConfig(steps=9, policy={"type": "vqbet", "scheduler_warmup_steps": 300})
+    assert "--policy.scheduler_warmup_steps=300" in sft_command(chosen, HUB, tmp_path / "sft", 0, "cpu")
     (tmp_path / "config.json").write_text(json.dumps({"type": kind}))
     start = SFTConfig(steps=9, init_path=str(tmp_path), extra_args=["--log_freq=1"])
     command = sft_command(start, HUB, tmp_path / "sft", 0, "cpu")
