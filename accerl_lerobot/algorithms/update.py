@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,11 +22,16 @@ from accerl_lerobot.errors import step_if_finite
 from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX
 
+logger = logging.getLogger(__name__)
+
 STD_EPSILON = 1e-6  # added to a standard deviation: numbers that are all equal become 0, not noise
 
 
 def make_update(adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig) -> BaseUpdate:
-    """The updates that belong to an algorithm."""
+    """The updates that belong to an algorithm. A policy that does not look at its images is warned of."""
+    if not adapter.sees():
+        hint = "train it with a lower learning rate or a longer warm-up (sft.policy.scheduler_warmup_steps)"
+        logger.warning("policy.path: the policy acts the same whatever its images show; %s", hint)
     return imported(algorithm.update)(adapter, algorithm, config)
 
 

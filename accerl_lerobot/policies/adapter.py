@@ -12,6 +12,7 @@ import contextlib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 
 HIDDEN = 128
+ROUNDING = 1e-5  # by which numbers of two decisions may differ and be the same
 SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
 
 
@@ -139,6 +141,10 @@ class PolicyAdapter(nn.Module, ABC):
                 # A copy: received arrays are read-only, which torch cannot express.
                 parameter.copy_(part_of(torch.tensor(tensors[name]), parameter))
 
+    def sees(self) -> bool:
+        """False if a decision does not depend on the images."""
+        return True
+
     def view_trainable(self) -> dict[str, np.ndarray]:
         """`trainable` as NumPy arrays; on a CPU the parameters' own memory, to be copied before an update."""
         views: dict[str, np.ndarray] = {}
@@ -213,6 +219,19 @@ class PretrainedAdapter(PolicyAdapter):
         """Writes LeRobot's ``pretrained_model`` layout; without `weights`, those of now."""
         weights = weights or self.copy_weights()
         saving.save_pretrained(self.policy, self.processing, directory, weights)
+
+    def sees(self) -> bool:
+        request, other = self.example_requests()
+        images: Observation = {}
+        for name, value in other.observation.items():
+            if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+                images[name] = value
+        if not images:
+            return True
+        changed = replace(request, observation=request.observation | images)
+        first, second = (self.decide([one], 0)[0] for one in (request, changed))
+        pairs = ((first.chunk, second.chunk), (first.log_prob, second.log_prob))
+        return not all(np.allclose(*pair, rtol=ROUNDING, atol=ROUNDING) for pair in pairs)
 
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length.

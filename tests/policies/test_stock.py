@@ -24,6 +24,8 @@ from safetensors.torch import save_file
 
 from accerl_lerobot import cli, evaluate, load_policy
 from accerl_lerobot.algorithms import SelfImitationConfig, chunk_critic, off_policy
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.update import make_update
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -324,6 +326,20 @@ def test_in_python_an_episode_begins_with_reset(vqbet: Path):
     policy.reset()
     (expected,) = acting(vqbet).decide([replace(asked[0], noise_seed=noise_seed(1, 0))], 0)
     np.testing.assert_array_equal(policy.act(first), expected.chunk)
+
+
+def test_a_policy_that_does_not_look_at_its_images_is_warned_of(
+    vqbet: Path, caplog: pytest.LogCaptureFixture
+):
+    config = PolicyConfig(path=str(vqbet), device="cpu", sampler=ChunkNoiseConfig())
+    algorithm, trainer = SelfImitationConfig(), TrainerConfig()
+    adapter: Any = load_adapter(config)
+    make_update(adapter, algorithm, trainer)
+    assert adapter.sees() and not caplog.records
+    with torch.no_grad():  # as a rectifier that is never active
+        adapter.policy.vqbet.rgb_encoder.out.weight.zero_()
+    make_update(adapter, algorithm, trainer)
+    assert "acts the same whatever its images show" in caplog.text
 
 
 REGISTERS = """
