@@ -222,16 +222,14 @@ class PretrainedAdapter(PolicyAdapter):
 
     def sees(self) -> bool:
         request, other = self.example_requests()
-        images: Observation = {}
-        for name, value in other.observation.items():
-            if isinstance(value, np.ndarray) and value.dtype == np.uint8:
-                images[name] = value
-        if not images:
-            return True
+        names = [name for name in request.observation if name not in (TASK, STATE)]
+        images = {name: other.observation[name] for name in names}
         changed = replace(request, observation=request.observation | images)
-        first, second = (self.decide([one], 0)[0] for one in (request, changed))
-        pairs = ((first.chunk, second.chunk), (first.log_prob, second.log_prob))
-        return not all(np.allclose(*pair, rtol=ROUNDING, atol=ROUNDING) for pair in pairs)
+        first = self.decide([request], 0)[0]
+        second = self.decide([changed], 0)[0]
+        same = np.allclose(first.chunk, second.chunk, ROUNDING, ROUNDING)
+        same = same and np.allclose(first.log_prob, second.log_prob, ROUNDING, ROUNDING)
+        return not (same and images)
 
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length.
