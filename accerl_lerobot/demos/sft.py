@@ -43,7 +43,7 @@ PROGRESS = re.compile(
 ANSWER = "accerl hands over: "
 """Begins the last line of a trainer; warnings and the last exception follow, as JSON."""
 LOG_EVERY = 25  # steps
-WARMUP_STEPS = 20
+MOST_WARMUP = 3  # a warm-up of the learning rate lasts at most the steps divided by this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,8 @@ class SFTConfig(Section, section="sft"):
     batch_size: Annotated[int, Range("[1, 65536]")] = 64
     """Frames per step."""
     lr: LearningRate = 1e-3
-    """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
+    """Peak learning rate. Where LeRobot's preset of the policy type has a schedule, it rises for as many
+    steps as there, at most a third of `steps`, and then decays."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes that are imitated, by ``next.success``, or ``next.reward`` without it; the others stay in the
     dataset."""
@@ -112,7 +113,7 @@ def sft_command(
             policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares a download
     preset = {
         "optimizer_lr": config.lr,
-        "scheduler_warmup_steps": WARMUP_STEPS,
+        "scheduler_warmup_steps": min(known.get("scheduler_warmup_steps", 0), config.steps // MOST_WARMUP),
         "scheduler_decay_steps": config.steps,
     }
     policy = {name: value for name, value in preset.items() if name in known} | policy
@@ -256,13 +257,13 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     return wanted
 
 
-def policy_fields(kind: str, field: str) -> set[str]:
-    """Names of the fields of LeRobot's config of a policy type; an unknown type is refused."""
+def policy_fields(kind: str, field: str) -> dict[str, Any]:
+    """Fields of LeRobot's config of a policy type, with their defaults; an unknown type is refused."""
     from lerobot.configs.policies import PreTrainedConfig
 
     register_policies(kind)
     check_registered(kind, field)
-    return {own.name for own in fields(PreTrainedConfig.get_choice_class(kind))}
+    return {own.name: own.default for own in fields(PreTrainedConfig.get_choice_class(kind))}
 
 
 def _step(progress: re.Match[str]) -> int:

@@ -152,7 +152,7 @@ def test_the_command_line(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "schedule"), [("act", set()), ("diffusion", {"--policy.scheduler_warmup_steps=20"})]
+    ("kind", "schedule"), [("act", set()), ("diffusion", {"--policy.scheduler_warmup_steps=3"})]
 )
 def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set[str]):
     command = sft_command(SFTConfig(steps=9, policy={"type": kind}), HUB, tmp_path / "sft", 0, "cpu")
