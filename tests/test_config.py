@@ -147,6 +147,7 @@ def test_a_recipe_says_how_it_differs_from_its_base(recipe: str, tmp_path: Path)
     middle.write_text("policy: {trust_remote_code: abc}")
     for base, message in (
         ("nowhere", "^base='nowhere': no such file"),
+        (top, "^base=.*top.yaml': this recipe is laid on itself"),
         (f"../{tmp_path.name}/top.yaml", "^base=.*top.yaml': this recipe is laid on itself"),
         (middle, "a file cannot allow this"),
     ):
