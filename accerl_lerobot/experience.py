@@ -65,7 +65,7 @@ class Decision:
     chunk: np.ndarray  # float32 (K, A), in the environment's action units (un-normalised); not clipped
     latent: dict[str, np.ndarray]  # what the policy sampled; `log_prob` is its density in normalised units
     log_prob: np.ndarray  # float32 (L,), an entry per factor, such as a row; the chunk's is their sum
-    version: int  # number of optimiser steps behind the weights that decided
+    version: int  # of the weights that decided: the number of updates that made them
 
 
 @kind

@@ -38,14 +38,14 @@ class LightInference:
 
     async def ready(self, trainer: Any = None) -> int:
         if trainer is not None:
-            version, _ = await trainer.newer_than.remote(self._name, -1)
+            version, _ = await trainer.next_weights.remote(self._name, -1)
             self._version = max(0, version)
         return os.getpid()
 
     async def follow(self, trainer: Any) -> None:
         async def follow(version: int) -> None:
             while True:
-                version, _ = await trainer.newer_than.remote(self._name, version)
+                version, _ = await trainer.next_weights.remote(self._name, version)
                 self._version = max(0, version)
 
         self._following = asyncio.create_task(follow(-1))
@@ -127,16 +127,16 @@ class LightTrainer:
                 version = len(self._ledger)
                 self._records.append({"update": float(version)})
             publisher.publish(version, {})
-            publisher.flush()
+            publisher.wait_until_applied()
         return self._config.updates
 
-    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
-        return self._publisher.newer_than(reader, version)
+    def next_weights(self, reader: str, version: int) -> tuple[int, list[Any]]:
+        return self._publisher.next_weights(reader, version)
 
     def metrics(self) -> list[dict[str, float]]:
-        return self.hold()[1]
+        return self.copy_state()[1]
 
-    def hold(self) -> tuple[int, list[dict[str, float]]]:
+    def copy_state(self) -> tuple[int, list[dict[str, float]]]:
         with self._lock:
             records, self._records = self._records, []
             self._kept = list(self._ledger)

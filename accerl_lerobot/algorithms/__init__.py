@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The objectives as the papers state them: typed tensors in, loss and diagnostics out.
+"""Algorithms: objectives with a likelihood ratio, as their papers state them, and off-policy updates.
 
 To add one, register a config under `AlgorithmConfig`: a `RatioConfig` with a `loss` that ends in
 `objective.assemble`, as GIPO's does, or an `OffPolicyConfig` whose `update` names a subclass of

@@ -49,7 +49,11 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyConfig(AlgorithmConfig):
-    """Base of the algorithms that learn from a memory of all episodes and need no likelihood."""
+    """Base of the algorithms that learn from a memory of all episodes and need no likelihood.
+
+    `engines.config` and `run.preflight` refuse what does not go with it: segments that are not whole
+    episodes, a decision that replay hands out twice, several ranks, imagined environments.
+    """
 
     update = "accerl_lerobot.algorithms.off_policy:OffPolicyUpdate"
 

@@ -124,7 +124,12 @@ class Memory:
 
 
 class OffPolicyUpdate(BaseUpdate):
-    """Updates for each ``batch_decisions`` of new experience; as it is, imitates successful episodes."""
+    """Updates for each ``batch_decisions`` of new experience; as it is, imitates successful episodes.
+
+    A subclass overrides what it does differently: `imitable`, `target` and `losses` of a policy step, `learn`
+    for further gradient steps, `columns` for what else is remembered, `n_step`. With networks of its own it
+    overrides `state` and `restore` too, and clips their gradients itself.
+    """
 
     n_step = 1  # decisions after which a target bootstraps
 
@@ -170,7 +175,7 @@ class OffPolicyUpdate(BaseUpdate):
         return metrics
 
     def imitable(self) -> np.ndarray:
-        """Rows of the memory that the policy imitates."""
+        """Rows of the memory that the policy imitates, and from which a critic's batches are drawn."""
         return np.flatnonzero(self.memory["success"])
 
     def target(self, rows: np.ndarray) -> Tensor:
@@ -197,7 +202,7 @@ class OffPolicyUpdate(BaseUpdate):
         self.memory.restore(state["memory"])
 
     def steps(self, name: str, each: float, new: int) -> range:
-        """As many steps as are due at ``each`` for a new decision; what is left over is due later."""
+        """The steps that are due after `new` decisions, `each` for one; a fraction is due later."""
         pending_steps = self._pending_steps.get(name, 0.0) + each * new
         due = int(pending_steps)
         self._pending_steps[name] = pending_steps - due

@@ -36,7 +36,7 @@ WRITING = ".writing-"  # how names of folders begin that are not complete, or re
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
-FORMAT = 8  # format of the manifest and the training state; another one is refused
+FORMAT = 9  # format of the manifest and the training state; another one is refused
 AWAY = "LOCAL"  # replaces the folders above a file of the machine that pushed it
 BACKBONE = "backbone"  # folder beside the weights with the vision-language backbone's config and tokenisers
 FAST = f"{BACKBONE}/fast"  # folder with the tokeniser of actions, where a policy has one

@@ -54,7 +54,7 @@ def train(arguments: list[str], load: Load | None = None) -> int:
 
     console = Console()
     try:
-        directory, summary = runs.start(config, console, read_arguments(arguments)[0], load)
+        directory, summary = runs.run_to_end(config, console, read_arguments(arguments)[0], load)
     except StoppedError as stopped:
         console.say(str(stopped))
         return 128 + stopped.number

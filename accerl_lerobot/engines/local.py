@@ -24,7 +24,13 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.rollout.runner import MOST_STARTS, EpisodePlan, EpisodePlans, RolloutRunner, Starts
+from accerl_lerobot.rollout.runner import (
+    MOST_STARTS,
+    EpisodePlan,
+    EpisodePlans,
+    FirstObservations,
+    RolloutRunner,
+)
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 
@@ -64,7 +70,7 @@ class LocalEngine(Engine):
         environments = [
             make_environment(config.env, history, config.rollout.reward_model) for _ in range(count)
         ]
-        starts: Starts = deque(maxlen=MOST_STARTS)
+        first: FirstObservations = deque(maxlen=MOST_STARTS)
         self._world: Any = None
         self._world_learner: Any = None
         if config.imagination.environments:
@@ -73,12 +79,12 @@ class LocalEngine(Engine):
 
             imagined = config.imagination.environments * config.rollout.workers
             spec = environments[0].spec
-            self._world, more = imagined_environments(config.imagination, imagined, spec, starts)
+            self._world, more = imagined_environments(config.imagination, imagined, spec, first)
             environments += more
             if config.imagination.learns:
                 self._world_learner = make_trainer(config)
         self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
-        self._runner = RolloutRunner(environments, self._plans, config.rollout, starts)
+        self._runner = RolloutRunner(environments, self._plans, config.rollout, first)
         if state is not None:
             self._restore(state)
         self._clock.enter(WAIT_IN)
@@ -182,7 +188,7 @@ class LocalEngine(Engine):
         for slot in range(len(runner)):
             request = runner.request(slot)
             if request is None or (request.explore and not self._exploring):
-                request = runner.start(slot)
+                request = runner.begin_episode(slot)
             if request is not None and (may_explore or not request.explore):
                 due[slot] = request
         if due:

@@ -179,9 +179,9 @@ class RayEngine(Engine):
     def save(self, directory: Path) -> Progress:
         directory = directory.absolute()
         state = directory / TRAINING_STATE
-        # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
+        # Records that the trainer has sent come first: `copy_state` returns the rest, up to its version.
         self._hear(self._trainer, self._limit)
-        version, records = self._trainer.call("hold")  # it waits for an update at most
+        version, records = self._trainer.call("copy_state")  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates.
         self._replay.call("save", state, version)
         if self._world_learner is not None:
@@ -252,7 +252,7 @@ class RayEngine(Engine):
         self, add: Callable[..., Worker], replicas: list[str], state: Path | None, load: Load | None
     ) -> Worker:
         """Create the trainer and the workers that learn with it; `add` makes one of them."""
-        from accerl_lerobot.trainer.worker import SHARE, LearnerSettings, TrainerRank, TrainerWorker
+        from accerl_lerobot.trainer.worker import RANK_WAIT_SHARE, LearnerSettings, TrainerRank, TrainerWorker
         from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
 
         config = self._config
@@ -260,7 +260,13 @@ class RayEngine(Engine):
         # The ranks before others with a network: Ray fills the GPU that is fullest, and each rank needs more
         # than half of one.
         settings = LearnerSettings(
-            config.policy, config.algorithm, config.trainer, config.seed, state, load, SHARE * self._limit
+            policy=config.policy,
+            algorithm=config.algorithm,
+            trainer=config.trainer,
+            seed=config.seed,
+            state=state,
+            load=load,
+            timeout_s=RANK_WAIT_SHARE * self._limit,
         )
         ranks = [
             add(f"trainer rank {rank}", "trainer", TrainerRank, 1, rank, settings).actor
@@ -387,7 +393,6 @@ class RayEngine(Engine):
 
     def _supervise(self) -> None:
         """Give up workers that hang, and go on with those that are being restarted."""
-        # Inference last: workers that wait for it are silent too.
         for worker in (*self._others, *self._rollouts, *self._inference):
             if isinstance(worker, RestartedWorker) and worker.is_starting:
                 self._last_change = time.monotonic()  # a restart has a timeout of its own

@@ -225,8 +225,8 @@ class RolloutSlot(RestartedWorker):
 
     @property
     def next_incarnation(self) -> int:
-        starts = 0 if self.last_answer is None else self.last_answer.starts
-        return incarnation_after(self.incarnation, starts)
+        seeds_used = 0 if self.last_answer is None else self.last_answer.seeds_used
+        return incarnation_after(self.incarnation, seeds_used)
 
     @property
     def spent(self) -> bool:

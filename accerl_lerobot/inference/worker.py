@@ -4,8 +4,9 @@
 consumes    requests for decisions, and the newest weights that the trainer has published
 produces    decisions, each stamped with the version of its weights
 waits for   a full batch, or until its oldest request has waited `max_wait_s`
-ends        with the run; an exception ends all connections, and Ray restarts the process. Its only state is
-            weights, except in ``accerl eval`` of a policy that keeps something between decisions
+ends        with the run. An exception ends `serve` and all connections; the driver then kills the process,
+            and Ray starts another. Its only state is weights, except in ``accerl eval`` of a policy that
+            keeps something between decisions
 
 Weights are swapped in between batches, so no batch sees two versions. One thread waits for clients and for
 the batcher's clock at once, runs the forward pass and replies. Ray's calls and weights come in on the event
@@ -76,27 +77,27 @@ class InferenceWorker:
         self._adapter = loader(load)(policy)
         self._batcher: Batcher[PendingRequest] = Batcher(config.max_batch, config.max_wait_s)
         self._server = Server(self._add, node_address(in_cluster))
-        self._version = version
-        self._fetched = -1  # version of the trainer's newest weights that have been applied
+        self._version = version  # of the weights, for decisions; that of the checkpoint at first
+        self._applied_version = -1  # newest version of the trainer's that has been applied
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
-        self._published: deque[tuple[int, Tensors]] = deque(maxlen=1)  # to be used from the next batch on
+        self._waiting_weights: deque[tuple[int, Tensors]] = deque(maxlen=1)  # used from the next batch on
         self._applied = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
         self._lock_step: deque[int] = deque(maxlen=1)
         self._over = False
-        self._iteration: float | None = None  # start of the serving thread's last one, while it lives
+        self._turn_began: float | None = None  # when the serving loop's last turn began, while it runs
         self._busy_s = 0.0  # time in forward passes
         self._reported = time.monotonic(), 0.0  # when `metrics` was called last, and the busy time then
         self._clock.enter(WAIT_IN)
 
     async def ready(self, trainer: Any = None) -> int:
-        """The process id, once the newest weights are loaded of a `trainer` that has begun."""
+        """Loads the newest weights of the `trainer`, if it has published any; returns the process id."""
         if trainer is not None:
-            version, references = await trainer.newer_than.remote(self._name, -1)
+            version, references = await trainer.next_weights.remote(self._name, -1)
             if references:
                 self._adapter.load_trainable(await references[0])
-                self._version = self._fetched = version
+                self._version = self._applied_version = version
         return os.getpid()
 
     async def listen(self) -> Address:
@@ -114,13 +115,13 @@ class InferenceWorker:
 
         with contextlib.suppress(RayError):  # a lost trainer is the engine's to deal with
             while True:
-                version, references = await trainer.newer_than.remote(self._name, self._fetched)
+                version, references = await trainer.next_weights.remote(self._name, self._applied_version)
                 if references:
                     self._applied.clear()
-                    self._published.append((version, await references[0]))
+                    self._waiting_weights.append((version, await references[0]))
                     self._server.wake()
                     await self._applied.wait()
-                    self._fetched = version
+                    self._applied_version = version
 
     async def lock_step(self, observations: int) -> None:
         self._lock_step.append(observations)
@@ -135,8 +136,12 @@ class InferenceWorker:
             self._server.wake()
 
     async def metrics(self) -> Metrics:
-        """Numbers for `merge_metrics`; does not answer while the serving thread hangs."""
-        while self._iteration is not None and time.monotonic() - self._iteration > 2 * LOOK_S:
+        """Numbers for `merge_metrics`.
+
+        Does not answer while the serving thread is stuck, which the driver takes for a hang after
+        ``launch.stall_s``.
+        """
+        while self._turn_began is not None and time.monotonic() - self._turn_began > 2 * LOOK_S:
             await asyncio.sleep(0.1)
         self._clock.beat()
         since, busy_before = self._reported
@@ -149,7 +154,7 @@ class InferenceWorker:
     def _serve(self) -> None:
         try:
             while not self._over:
-                self._iteration = time.monotonic()
+                self._turn_began = time.monotonic()
                 self._clock.enter(WAIT_IN)
                 deadline = self._batcher.next_deadline()
                 wait = LOOK_S
@@ -162,7 +167,7 @@ class InferenceWorker:
                 if self._batcher.due(time.monotonic()):
                     self._serve_batch(self._batcher.take(time.monotonic()))
         finally:
-            self._iteration = None
+            self._turn_began = None
             self._server.close()  # clients learn at once that their requests will not be answered
 
     def _add(self, request: PendingRequest) -> None:
@@ -170,9 +175,9 @@ class InferenceWorker:
 
     def _swap(self) -> None:
         """Use the weights that have come."""
-        if not self._published:
+        if not self._waiting_weights:
             return
-        version, tensors = self._published.popleft()
+        version, tensors = self._waiting_weights.popleft()
         self._clock.enter(WEIGHT_SYNC)
         self._adapter.load_trainable(tensors)
         self._version = version

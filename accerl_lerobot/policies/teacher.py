@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from accerl_lerobot.world_model.states import StateModel, StateSpec
 
 WIDTH = 256
-SHARE = 0.5  # of exploring episodes, in which it acts once it is ready
+ACTING_SHARE = 0.5  # of exploring episodes, in which it acts once it is ready
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
 ENCODED = 64  # observations of which states are computed at once; images may be large
 TEACHER_PREFIX = "teacher."  # how names of its weights begin among those that are published
@@ -119,7 +119,7 @@ class Teacher(nn.Module):
     def plays(self, episode: int) -> bool:
         """True if, once ready, it makes all decisions of this exploring episode; see `seeds.episode_of`."""
         generator = np.random.default_rng((episode, 4))
-        return generator.random() < SHARE
+        return generator.random() < ACTING_SHARE
 
     @torch.no_grad()
     def replace(self, chunk: Tensor, requests: Sequence[Request]) -> Tensor:

@@ -34,10 +34,9 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Metrics, Segment, nonfinite
 from accerl_lerobot.replay.journal import Journal
 
-DRAWS = 1024
-"""Last draws that are remembered, for `Replay.state`: a trainer draws one batch ahead, and goes on while it
-is saved."""
-BATCH_SHARE = 0.5  # share of a batch that is trained on once collection has ended
+REMEMBERED_BATCHES = 1024
+"""For `Replay.state`: a trainer draws one batch ahead, and goes on while it is saved."""
+BATCH_SHARE = 0.5  # the smallest last batch, as a share of a full one; a smaller rest is not learned from
 
 Schedule = Literal["asynchronous", "overlap", "synchronous"]
 ASYNCHRONOUS: Schedule = "asynchronous"
@@ -53,11 +52,12 @@ class ReplayConfig(Section, section="replay"):
     """Decisions held at most, those without draws left too; the oldest segments leave first. At least
     `max_unlearned_decisions` plus one segment."""
     min_decisions: Annotated[int, Range("[1, 100000000]")] = 256
-    """Decisions that must be held before the trainer starts (warm start), from 1 to `capacity`."""
+    """The trainer waits while fewer decisions are held: at the start, and if many were retired. From 1 to
+    `capacity`."""
     samples_per_insert: Annotated[float, Range("[1, 1000000]")] = 1.0
     """How often a decision is trained on, on average: collect less rather than throw away."""
     max_lag: Steps = 50
-    """A segment whose oldest decision is more updates behind the trainer than this is retired, at least 0.
+    """A segment is retired once its oldest decision has a lag of more updates than this, at least 0.
 
     A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away. What an
     off-policy algorithm keeps in a memory of its own may be older.
@@ -78,11 +78,11 @@ class ReplayConfig(Section, section="replay"):
             hint = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
             raise InputError("replay.max_unlearned_decisions", self.max_unlearned_decisions, hint)
         # Each of a segment's draws is for another update.
-        oldest = math.ceil(self.samples_per_insert) - 1
-        if self.max_lag < oldest:
+        least_age = math.ceil(self.samples_per_insert) - 1
+        if self.max_lag < least_age:
             hint = (
-                f"with replay.samples_per_insert={self.samples_per_insert:g} what is drawn last is {oldest} "
-                f"updates old at least; use {oldest} or more, rather several times as many"
+                f"with replay.samples_per_insert={self.samples_per_insert:g} what is drawn last is "
+                f"{least_age} updates old at least; use {least_age} or more, rather several times as many"
             )
             raise InputError("replay.max_lag", self.max_lag, hint)
         least = self.most_available + segment_decisions - 1
@@ -151,16 +151,19 @@ class ReplayCounters:
 
 @dataclass(eq=False)
 class Entry:
-    """A stored segment, which may be drawn `draws` times in all; once it has `left`, its numbers only."""
+    """A stored segment, which may be drawn `draws` times in all.
+
+    Once it is removed, `segment` is None; the counts stay for `Replay.state`.
+    """
 
     segment: Any
     draws: int
     uses: int = 0
-    left: str = ""  # ``evicted`` or ``retired``
+    removed_as: str = ""  # ``evicted`` or ``retired``
 
     def __post_init__(self) -> None:
         self.size = len(self.segment)
-        self.oldest = int(self.segment.version.min())
+        self.oldest_version = int(self.segment.version.min())
         self.imagined = self.segment.source != REAL
 
     @property
@@ -183,7 +186,8 @@ class Replay:
         self._journal = journal
         self._entries: deque[Entry] = deque()  # oldest first
         self._remainder = 0.0
-        self._drawn: deque[tuple[int, list[Entry]]] = deque(maxlen=DRAWS)  # trainer version, and its batch
+        # Versions of the trainer, and the batches that it drew.
+        self._drawn: deque[tuple[int, list[Entry]]] = deque(maxlen=REMEMBERED_BATCHES)
 
     def may_insert(self) -> bool:
         """True if rollouts should bring another segment now; `insert` does not refuse one too many."""
@@ -230,11 +234,11 @@ class Replay:
         return True
 
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
-        """Draws the available segments that were used least, in random order; first retires too old ones.
+        """Retires segments that are too old, then draws whole ones until there are `num_decisions`.
 
-        Whole segments are drawn until there are `num_decisions`, none twice; `rng` decides among segments
-        used equally often. Empty, with nothing counted as used, if fewer decisions are available. That can
-        happen although `may_sample` held, when segments were too old: try again later.
+        Those used least come first, none twice; `rng` decides among segments used equally often. Empty, with
+        nothing counted as used, if fewer decisions are available. That can happen although `may_sample` held,
+        when segments were too old: try again later.
         """
         self.retire(trainer_version)
         if self.ended and self.may_sample(num_decisions):
@@ -256,7 +260,7 @@ class Replay:
     def retire(self, trainer_version: int) -> None:
         """Removes segments that are too old for a trainer that has made so many updates."""
         cutoff = trainer_version - self.config.max_lag
-        old = [entry for entry in self._entries if entry.oldest < cutoff]
+        old = [entry for entry in self._entries if entry.oldest_version < cutoff]
         for entry in old:
             self._remove(entry, "retired")
 
@@ -271,7 +275,8 @@ class Replay:
     def state(self, version: int | None = None) -> State:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
-        Batches drawn for updates after `version` count as not drawn. None: the trainer has learned from all.
+        Batches drawn for updates after `version` count as not drawn, because the resumed trainer draws again.
+        None: the trainer has learned from all.
         """
         unlearned: Counter[Entry] = Counter()
         for drawn_at, batch in self._drawn:
@@ -282,8 +287,8 @@ class Replay:
             counters.trained(entry, -times)
             if times == entry.uses:
                 counters.unique_decisions -= entry.size
-                if entry.left:
-                    _count_unused(counters, entry.left)
+                if entry.removed_as:
+                    _count_unused(counters, entry.removed_as)
         entries: list[dict[str, Any]] = []
         for entry in self._entries:
             uses = entry.uses - unlearned[entry]
@@ -329,7 +334,7 @@ class Replay:
         if entry.available:
             self.available_decisions -= entry.size
         entry.segment = None
-        entry.left = how
+        entry.removed_as = how
         self.counters.removed_segments += 1
         self.counters.removed_decisions += entry.size
         if entry.uses == 0:

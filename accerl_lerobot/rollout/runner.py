@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps several environments at once, each at its own decision: the rollout worker without its process.
 
-A slot is one environment. `start` resets it and `advance` executes a decision in it; both return the request
-for the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
+A slot is one environment. `begin_episode` resets it and `advance` executes a decision in it; both return the
+request for the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at
+once.
 
 `EpisodePlans` says which episode a free environment runs next: planned evaluations first, then exploring
 ones, of each task in turn and of failing ones more often, with seeds of this worker's own (`seeds.py`).
@@ -37,12 +38,12 @@ from accerl_lerobot.experience import (
 from accerl_lerobot.seeds import noise_seed, train_seed
 from accerl_lerobot.timeline import COMPUTE, Clock, NoClock
 
-STARTS_PER_INCARNATION = 1000
+SEEDS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
 LEAST_SHARE = 0.1  # how often a task that never fails is explored, compared with one that always does
 RECENT = 20  # episodes of a task that tell how often it fails now
 MOST_STARTS = 256  # newest real episodes at whose first observation imagined ones start
-Starts = deque[tuple[str, Observation]]  # tasks and first observations of real episodes, the newest last
+FirstObservations = deque[tuple[str, Observation]]  # of real episodes, with their tasks, the newest last
 MOST_DROPPED = 20  # episodes in a row that may be dropped before the environment counts as broken
 
 
@@ -82,9 +83,9 @@ class EpisodePlan:
     which changes nothing else."""
 
 
-def start_of(starts: Starts, seed: int) -> tuple[str, Observation]:
+def start_of(first: FirstObservations, seed: int) -> tuple[str, Observation]:
     """Task and first observation of the imagined episode with this seed."""
-    return starts[seed % len(starts)]
+    return first[seed % len(first)]
 
 
 def budgets(config: RolloutConfig) -> list[int | None]:
@@ -95,12 +96,12 @@ def budgets(config: RolloutConfig) -> list[int | None]:
     return [each + int(worker < more) for worker in range(config.workers)]
 
 
-def incarnation_after(incarnation: int, starts: int) -> int:
+def incarnation_after(incarnation: int, seeds_used: int) -> int:
     """Number of the process that takes a worker's place, such that it meets none of its seeds again.
 
-    `starts` is where the one before was in its seeds when it last said so; it may have gone on since.
+    `seeds_used` is of the last report of the process before, which may have used more since.
     """
-    reached = (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION
+    reached = (seeds_used + SEEDS_PER_INCARNATION // 2) // SEEDS_PER_INCARNATION
     return max(incarnation, reached) + 1
 
 
@@ -120,8 +121,8 @@ class EpisodePlans:
         self._tasks = tasks
         self._seed = seed
         self._budget = budget
-        self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
-        self.imagined = self.starts  # the same, of imagined episodes
+        self.seeds_used = incarnation * SEEDS_PER_INCARNATION  # of the worker's, for real episodes
+        self.imagined_seeds_used = self.seeds_used
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
         self._failing = dict.fromkeys(tasks, 1.0)
@@ -134,21 +135,21 @@ class EpisodePlans:
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
 
-    def next(self, source: str, starts: Starts) -> EpisodePlan | None:
+    def next(self, source: str, first: FirstObservations) -> EpisodePlan | None:
         """The episode that a free environment of this source is to run; None: it has to wait.
 
-        An imagined one begins at one of `starts`.
+        An imagined one begins at one of the `first` observations.
         """
         if source != REAL:
-            return self._next_imagined(starts)
+            return self._next_imagined(first)
         if self._queued:
             return self._queued.popleft()
         if not self.exploring or self.spent:
             return None
         if self._budget is not None:
             self._budget -= 1
-        seed = train_seed(self._seed, self.worker, self.starts)
-        self.starts += 1
+        seed = train_seed(self._seed, self.worker, self.seeds_used)
+        self.seeds_used += 1
         shares = {task: max(failing, LEAST_SHARE) for task, failing in self._failing.items()}
         total = sum(shares.values())
         for task, share in shares.items():
@@ -157,13 +158,12 @@ class EpisodePlans:
         self._due[task] -= 1
         return EpisodePlan(task=task, seed=seed, explore=True)
 
-    def _next_imagined(self, starts: Starts) -> EpisodePlan | None:
-        if not self.exploring or not starts:
+    def _next_imagined(self, first: FirstObservations) -> EpisodePlan | None:
+        if not self.exploring or not first:
             return None
-        number = self.imagined
-        self.imagined += 1
-        seed = train_seed(self._seed, self.worker, number)
-        task, _ = start_of(starts, seed)
+        seed = train_seed(self._seed, self.worker, self.imagined_seeds_used)
+        self.imagined_seeds_used += 1
+        task, _ = start_of(first, seed)
         return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)
 
     def ended(self, result: EpisodeResult) -> None:
@@ -181,8 +181,8 @@ class EpisodePlans:
     def state(self) -> dict[str, Any]:
         return {
             "budget": self._budget,
-            "starts": self.starts,
-            "imagined": self.imagined,
+            "seeds_used": self.seeds_used,
+            "imagined_seeds_used": self.imagined_seeds_used,
             "queued": list(self._queued),
             "failing": dict(self._failing),
             "due": dict(self._due),
@@ -190,8 +190,8 @@ class EpisodePlans:
 
     def restore(self, state: dict[str, Any]) -> None:
         self._budget = state["budget"]
-        self.starts = state["starts"]
-        self.imagined = state["imagined"]
+        self.seeds_used = state["seeds_used"]
+        self.imagined_seeds_used = state["imagined_seeds_used"]
         self._queued.extend(state["queued"])
         self._failing = state["failing"]
         self._due = state["due"]
@@ -204,7 +204,7 @@ class EpisodeResult:
 
     plan: EpisodePlan
     success: bool
-    episode_return: float
+    episode_return: float  # less `RolloutConfig.decision_cost` a decision, if it explored
     steps: int
     decisions: int
     versions: tuple[int, int]  # oldest and newest weights that decided in it
@@ -229,16 +229,18 @@ class Counters:
 
 
 @kind
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class ActiveEpisode:
     """An episode under way in `RolloutRunner`, and the segment that is collected of it."""
 
+    # Of the segment:
+    observations: list[Observation]  # the next decision is about the last one
+    taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
+    """Decisions, each with its actions, reward and env steps."""
+    # Of the episode:
     plan: EpisodePlan
     time_limit: int  # env steps of an episode at most
-    observations: list[Observation]  # of the segment; the next decision is about the last one
-    taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
-    """Decisions of the segment, each with its actions, reward and env steps."""
-    episode_return: float = 0.0
+    episode_return: float = 0.0  # less the decision costs, if it explores
     steps: int = 0
     versions: list[int] = field(default_factory=list)  # of the weights of each decision
     frames: list[np.ndarray] = field(default_factory=list)
@@ -293,15 +295,15 @@ class ActiveEpisode:
 class RolloutRunner:
     """Drives a set of environments, one per slot, through the episodes of `plans`.
 
-    A slot for which none is planned stays idle until `start` is called again. `segments`, of exploring
-    episodes, and `results`, of all episodes, are there to be taken. `starts` gets the tasks and first
-    observations of real exploring episodes. `clock` enters `COMPUTE` when an episode begins.
+    A slot for which none is planned stays idle until `begin_episode` is called again. `segments`, of
+    exploring episodes, and `results`, of all episodes, are there to be taken. `first_observations` is filled
+    from real exploring episodes. `clock` enters `COMPUTE` when an episode begins.
     """
 
     environments: Sequence[Environment]
     plans: EpisodePlans
     config: RolloutConfig
-    starts: Starts = field(default_factory=lambda: deque(maxlen=MOST_STARTS))
+    first_observations: FirstObservations = field(default_factory=lambda: deque(maxlen=MOST_STARTS))
     clock: Clock = field(default_factory=NoClock)
 
     def __post_init__(self) -> None:
@@ -324,26 +326,29 @@ class RolloutRunner:
                 return True
         return False
 
-    def start(self, slot: int) -> Request | None:
+    def begin_episode(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
         environment = self.environments[slot]
-        plan = self.plans.next(environment.source, self.starts)
+        plan = self.plans.next(environment.source, self.first_observations)
         if plan is None:
             self._episodes[slot] = None
             return None
         self.clock.enter(COMPUTE)
         observation = environment.reset(plan.seed, plan.task)
-        episode = ActiveEpisode(plan, environment.spec.max_steps, [observation])
+        episode = ActiveEpisode(plan=plan, time_limit=environment.spec.max_steps, observations=[observation])
         self._episodes[slot] = episode
         bad = nonfinite(observation)
         if bad:
             return self._drop(slot, episode, f"{bad} of the first observation")
         if plan.explore and plan.source == REAL:
-            self.starts.append((plan.task, observation))
+            self.first_observations.append((plan.task, observation))
         return episode.request()
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
-        """Executes `decision`; the request is about the same episode, or the first of the next one."""
+        """Executes `decision`, and cuts a segment if one is full or the episode has ended.
+
+        Returns the next request: of the same episode, or the first of the next one, if one is planned.
+        """
         environment = self.environments[slot]
         episode = self._episodes[slot]
         assert episode is not None
@@ -366,13 +371,14 @@ class RolloutRunner:
         if result.done or len(episode.taken) >= self.config.segment_length:
             self._sequence += 1
             key = f"rollout{self.plans.worker}.{self.plans.incarnation}.{self._sequence}"
+            # Of an evaluation too, so that its observations are freed.
             segment = episode.cut(key, result.done, result.success)
             if episode.plan.explore:
                 self.segments.append(segment)
         if result.done:
             self._dropped = 0
             self._finish(episode, result.success, result.note)
-            return self.start(slot)
+            return self.begin_episode(slot)
         return episode.request()
 
     def _drop(self, slot: int, episode: ActiveEpisode, bad: str) -> Request | None:
@@ -388,7 +394,7 @@ class RolloutRunner:
             warn_once(note)
         else:  # an evaluation counts every episode it planned
             self._finish(episode, success=False, note=note)
-        return self.start(slot)
+        return self.begin_episode(slot)
 
     def request(self, slot: int) -> Request | None:
         """Request of the episode in `slot`; None if it waits for nothing."""
@@ -401,7 +407,7 @@ class RolloutRunner:
             "sequence": self._sequence,
             "episodes": list(self._episodes),
             "environments": [environment.state() for environment in self.environments],
-            "starts": list(self.starts),
+            "first_observations": list(self.first_observations),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -409,7 +415,7 @@ class RolloutRunner:
         self.counters = state["counters"]
         self._sequence = state["sequence"]
         self._episodes = state["episodes"]
-        self.starts.extend(state["starts"])
+        self.first_observations.extend(state["first_observations"])
         slots = zip(self.environments, self._episodes, state["environments"], strict=True)
         for environment, episode, kept in slots:
             if episode is None:

@@ -6,7 +6,8 @@ consumes    decisions, and orders: planned episodes, and whether to explore; ver
 produces    segments of exploring episodes for replay, and results of episodes
 waits for   decisions, if every environment has an observation under way; pauses exploring while replay does
             not take segments
-ends        with the run; an environment that raises ends `run`, and Ray restarts the process
+ends        with the run; an environment that raises ends `run`; the driver then kills
+            the process, and Ray starts another
 
 It outlives inference, whose successor is asked again what has not been answered. Imports neither torch nor
 LeRobot, unless its environment does.
@@ -33,9 +34,9 @@ from accerl_lerobot.rollout.runner import (
     EpisodePlan,
     EpisodePlans,
     EpisodeResult,
+    FirstObservations,
     RolloutConfig,
     RolloutRunner,
-    Starts,
 )
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport import Client, Endpoint, ReconnectingClient
@@ -62,7 +63,7 @@ class Report:
     in_environment: bool = False  # True if that is to step or reset an environment
     moves: int = 0  # resets and executed chunks of its environments
     spent: bool = False  # every exploring episode of ``rollout.episodes`` has been played, and replay has it
-    starts: int = 0  # see `EpisodePlans.starts`
+    seeds_used: int = 0  # see `EpisodePlans`
 
 
 class RolloutWorker:
@@ -93,7 +94,7 @@ class RolloutWorker:
         self._environments = [
             make_environment(env, history, config.reward_model) for _ in range(config.environments)
         ]
-        self._starts: Starts = deque(maxlen=MOST_STARTS)
+        self._starts: FirstObservations = deque(maxlen=MOST_STARTS)
         self._world: Any = None  # an `imagined.World`
         self._new_world: deque[tuple[int, Any]] = deque(maxlen=1)
         if imagination is not None and imagination.environments:
@@ -140,7 +141,7 @@ class RolloutWorker:
             in_environment=in_environment,
             moves=self._moves,
             spent=self._spent,
-            starts=self._plans.starts,
+            seeds_used=self._plans.seeds_used,
         )
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
@@ -223,7 +224,7 @@ class RolloutWorker:
         """Begin an episode, or execute a decision; False if nothing is due in this slot then."""
         self._active = time.monotonic(), True
         if decision is None:
-            request = self._runner.start(slot)
+            request = self._runner.begin_episode(slot)
         else:
             fault_point("rollout.step")
             request = self._runner.advance(slot, decision)

@@ -94,15 +94,15 @@ class RunState:
     recent: list[bool] = field(default_factory=list)  # success of the newest exploring episodes
     imagined: list[bool] = field(default_factory=list)  # the same, of imagined episodes
     explored: int = 0  # exploring episodes that have ended
-    won: int = 0  # successes among them
+    successes: int = 0  # of these
     note: str = ""  # of the last of them that had one, see `EpisodeResult`
     lags: list[float] = field(default_factory=list)
     lag_max: float = 0.0
     ratio_max_dev: float = 0.0
-    base: dict[str, float] = field(default_factory=dict)  # counters when training began
-    steps: float = math.inf  # env steps of the training, once it has ended
-    evaluated: int = 0  # evaluations that were due by the number of updates
-    saved: int = 0  # checkpoints that were due by it
+    counters_before: dict[str, float] = field(default_factory=dict)  # when training began
+    training_steps: float | None = None  # env steps of the training, once it has ended
+    evaluations_due: int = 0  # so far, by the number of updates
+    checkpoints_due: int = 0
 
 
 class Recorder:
@@ -130,11 +130,11 @@ class Recorder:
         del state.recent[:-RECENT]
         for episode in explored:
             state.explored += 1
-            state.won += episode.success
+            state.successes += episode.success
             state.note = episode.note or state.note
         self.warn_if_hopeless(HOPELESS)
         # The first episodes to end are the short ones, which are successes.
-        training = math.isinf(state.steps)
+        training = state.training_steps is None
         if explored and training and len(state.recent) >= RECENT // 4:
             point = (self.env_steps(progress), _mean(state.recent))
             state.curve.append(point)
@@ -173,10 +173,12 @@ class Recorder:
 
     def since(self, progress: Progress, key: str) -> float:
         """A rollout counter since training began, evaluations meanwhile included."""
-        return progress.rollout.get(key, 0.0) - self.state.base.get(key, 0.0)
+        return progress.rollout.get(key, 0.0) - self.state.counters_before.get(key, 0.0)
 
     def env_steps(self, progress: Progress) -> float:
-        return min(self.state.steps, self.since(progress, "env_steps"))
+        if self.state.training_steps is not None:
+            return self.state.training_steps
+        return self.since(progress, "env_steps")
 
     def status(self, progress: Progress) -> str:
         """The words beside the bar of training."""
@@ -189,7 +191,7 @@ class Recorder:
 
     def warn_if_hopeless(self, least: int = 1) -> None:
         """Warn once if there were so many exploring episodes and none has succeeded."""
-        if self.state.explored >= least and not self.state.won:
+        if self.state.explored >= least and not self.state.successes:
             warn_once(
                 "none of the exploring episodes has succeeded; where success is the only reward there is "
                 "nothing to learn from: see env.success, and docs/troubleshooting.md"
@@ -246,7 +248,7 @@ class Loop:
         progress = self._train()
         self._save()
         self.recorder.warn_if_hopeless()
-        after, results = self._evaluate("after", self.state.steps)
+        after, results = self._evaluate("after", self.recorder.env_steps(progress))
         summary: dict[str, Any] = plain(self._summary(after, progress))
         layout.write_json(self.directory / layout.SUMMARY, summary)
         self._draw(filmed, results)
@@ -260,7 +262,8 @@ class Loop:
             self.state.before, results = self._evaluate("before", 0.0)
             filmed = [result for result in results if result.frames]
             snapshot.save(self.directory / FILMED, filmed)
-            self.state.base = self.engine.poll().rollout
+            progress = self.engine.poll()  # nothing else is under way: only its counters are of use
+            self.state.counters_before = progress.rollout
         if self.config.save_every_updates or self.config.save_every_s:
             self._save()
         return filmed
@@ -276,11 +279,12 @@ class Loop:
         self.times.rl_s = saved["times"]["rl_s"]
         self.times.warm_s = saved["times"]["warm_s"]
         if version < self.config.trainer.updates:  # more are asked for than were when it ended
-            state.steps = math.inf
+            state.training_steps = None
+        # The config may now ask for fewer evaluations or checkpoints.
         evaluations = _multiples(version, self.config.evaluation.every_updates)
         checkpoints = _multiples(version, self.config.save_every_updates)
-        state.evaluated = min(state.evaluated, evaluations)
-        state.saved = min(state.saved, checkpoints)
+        state.evaluations_due = min(state.evaluations_due, evaluations)
+        state.checkpoints_due = min(state.checkpoints_due, checkpoints)
         if not (self.directory / f"{FILMED}.json").is_file():
             return []
         filmed: list[EpisodeResult] = snapshot.load(self.directory / FILMED)
@@ -303,12 +307,12 @@ class Loop:
                 if progress.done:
                     break
                 evaluations = _multiples(progress.version, config.evaluation.every_updates)
-                if evaluations > self.state.evaluated:
+                if evaluations > self.state.evaluations_due:
                     self._evaluate_meanwhile(evaluations)
                 if self._save_is_due(progress) or self.stop.asked is not None:
                     self._save()
                 self.stop.check()
-        self.state.steps = self.recorder.env_steps(progress)
+        self.state.training_steps = self.recorder.env_steps(progress)
         return progress
 
     def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
@@ -331,7 +335,7 @@ class Loop:
 
     def _evaluate_meanwhile(self, number: int) -> None:
         """Queue the evaluation of this number, which rollout workers play beside exploring."""
-        self.state.evaluated = number
+        self.state.evaluations_due = number
         group = f"during-{number}"
         self.state.during[group] = []
         self._plan(self.config.evaluation.episodes_during, group)
@@ -340,7 +344,7 @@ class Loop:
         seconds = self.config.save_every_s
         if seconds and time.monotonic() - self._saved_at > seconds:
             return True
-        return _multiples(progress.version, self.config.save_every_updates) > self.state.saved
+        return _multiples(progress.version, self.config.save_every_updates) > self.state.checkpoints_due
 
     def _save(self) -> None:
         with self.times.clock.during(CHECKPOINT):
@@ -353,7 +357,7 @@ class Loop:
         """Fill the folder of a checkpoint; returns its number of updates."""
         saved = self.engine.save(folder)
         self.recorder.record_updates(saved.updates)
-        self.state.saved = _multiples(saved.version, self.config.save_every_updates)
+        self.state.checkpoints_due = _multiples(saved.version, self.config.save_every_updates)
         shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
         log = self.recorder.log.state()
         times = {"rl_s": self.times.rl_s, "warm_s": self.times.warm_s}
@@ -376,7 +380,7 @@ class Loop:
         return {
             **{f"{name}_before": before.get(name) for name in RATE},
             **{f"{name}_after": after[name] for name in RATE},
-            "env_steps": int(state.steps),
+            "env_steps": int(self.recorder.env_steps(last)),
             **{name: int(self.recorder.since(last, name)) for name in COUNTERS},
             "updates": last.version,
             "trained_decisions": int(last.replay.get("trained_decisions", 0)),

@@ -99,7 +99,7 @@ def policy_play(
     plans.exploring = True
     runner = RolloutRunner(environments, plans, config.rollout)
     with closing(runner):
-        requests = {slot: runner.start(slot) for slot in range(len(runner))}
+        requests = {slot: runner.begin_episode(slot) for slot in range(len(runner))}
         while due := {slot: request for slot, request in requests.items() if request}:
             for slot, decision in zip(due, adapter.decide(list(due.values()), 0), strict=True):
                 requests[slot] = runner.advance(slot, decision)

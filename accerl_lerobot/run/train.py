@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One run from start to summary: demonstrations → SFT → evaluation → asynchronous RL → evaluation.
 
-`start` opens Ray, `Run.execute` does the phases, `Run.practise` makes engines, `Loop.run` works with one.
+`run_to_end` opens Ray, `Run.execute` does the phases, `Run.practise` makes engines, and `Loop.run` works with
+one.
 `loop` has the processes of a run and what each of them waits for. ``docs/cli.md`` lists the files of a run's
 folder.
 
@@ -81,7 +82,7 @@ def discard_unused(directory: Path) -> None:
         shutil.rmtree(directory)
 
 
-def start(
+def run_to_end(
     config: RunConfig, console: Console, recipe_path: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is at `recipe_path`."""
@@ -154,7 +155,7 @@ def make_engine(
     config = _with_absolute_paths(config)
     if state is not None:
         state = state.absolute()
-    load_with_teacher = functools.partial(
+    load_adapter = functools.partial(
         make_adapter,
         config.algorithm,
         config.state_model,
@@ -165,11 +166,11 @@ def make_engine(
     if config.launch.engine == "local":
         from accerl_lerobot.engines.local import LocalEngine
 
-        return LocalEngine(config, spec.tasks, history, state, load_with_teacher)
+        return LocalEngine(config, spec.tasks, history, state, load_adapter)
     ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engines.ray_engine import RayEngine
 
-    return RayEngine(config, spec.tasks, history, state, load_with_teacher, learns)
+    return RayEngine(config, spec.tasks, history, state, load_adapter, learns)
 
 
 def fine_tune(
@@ -306,7 +307,8 @@ class Run:
     def practise(self, checkpoint: Path | None) -> dict[str, Any]:
         """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""
         stop = Stopping(self.resume_command)
-        lost = 0
+        checkpoints = self.directory / layout.CHECKPOINTS
+        failures = 0  # in a row, without a later update
         most = self.config.launch.max_restarts
         with (
             handled(stop.note),
@@ -317,14 +319,16 @@ class Run:
                 furthest = self.times.furthest
                 try:
                     return self._practise_with_engine(checkpoint, stop, log)
-                except WorkerError as loss:
+                except WorkerError as failure:
                     self.times.clock.enter(RECOVERY)
                     stop.check()
-                    lost = 1 if self.times.furthest > furthest else lost + 1
-                    if lost > most or not layout.has_checkpoint(self.directory / layout.CHECKPOINTS):
+                    if self.times.furthest > furthest:
+                        failures = 0
+                    failures += 1
+                    if failures > most or not layout.has_checkpoint(checkpoints):
                         raise
                     checkpoint = resuming.newest_checkpoint(self.directory, layout.LAST, self.console)
-                    self.console.say(f"{loss}\ngoing on from {checkpoint} ({lost} of {most} times)")
+                    self.console.say(f"{failure}\ngoing on from {checkpoint} ({failures} of {most} times)")
                     layout.go_back_to(checkpoint)
                     self.config = resuming.continued(self.config, self.directory, checkpoint)
 
@@ -376,7 +380,7 @@ class ActingPolicy:
         self._episode = self._decisions = 0
 
     def reset(self) -> None:
-        """Begins another episode, for policies that remember former observations or actions."""
+        """Begins another episode: what the policy remembers is cleared, and its noise becomes another."""
         self._episode += 1
         self._decisions = 0
 
@@ -416,14 +420,14 @@ def train(config: RunConfig) -> TrainResult:
     """
     if config.resume:
         raise InputError("resume", True, "use accerl_lerobot.resume(DIRECTORY)")
-    return _result(*start(config, Console()))
+    return _result(*run_to_end(config, Console()))
 
 
 def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
     """Resumes a run that was stopped, from its last complete checkpoint."""
     recipe = expanded(str(directory), "directory") / layout.CONFIG
     config = load_config(recipe, {**(changes or {}), "resume": True})
-    return _result(*start(config, Console(), recipe))
+    return _result(*run_to_end(config, Console(), recipe))
 
 
 def evaluate(
@@ -434,8 +438,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Success of a policy with LeRobot's own sampler, on starts that no run of this seed trains on.
 
-    `config` has the environment, seed and workers, the `policy`, a LeRobot checkpoint on disk or the Hub (of
-    the commit `revision`), and the number of `episodes`, where these are not given.
+    Environment, seed and workers come from `config`; so do `policy` and `episodes`, unless they are given.
+    `policy` is a LeRobot checkpoint on disk or the Hub, and `revision` its commit.
     """
     if policy is not None:
         config = resuming.improving(config, policy)
@@ -445,7 +449,7 @@ def evaluate(
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
     with redirect_stdout(sys.stderr):
         results = play_evaluation(config, Console())
-    tasks = {task: rate_of(episodes) for task, episodes in by_task(results).items()}
+    tasks = {task: rate_of(played) for task, played in by_task(results).items()}
     return EvaluationResult(success=rate_of(results), tasks=tasks, episodes=results)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainer process: the run's clock.
+"""The trainer process. The length of a run is counted in its updates.
 
 consumes    batches of segments from replay, the next one drawn while the current one is learned from
 produces    weights, published after each update for the replicas that ask, also after the last update
@@ -14,7 +14,8 @@ The trainer may have other ranks, processes that make each update along with the
                         ◄── torch.distributed: values, gradients, parts of weights ──►
 
 Work of all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. A
-rank that is lost ends the wait, after `SHARE` of ``launch.stall_s`` at the latest, and with it the trainer.
+rank that is lost ends the wait, after `RANK_WAIT_SHARE` of ``launch.stall_s`` at the latest, and with it the
+trainer.
 """
 
 from __future__ import annotations
@@ -45,9 +46,10 @@ if TYPE_CHECKING:
     from accerl_lerobot.algorithms.update import BaseUpdate
 
 LOAD_S = 600.0  # how long a rank may take to load its policy
-SHARE = 0.4
-"""Share of ``launch.stall_s`` for which a rank waits for the others, so that the trainer ends by itself."""
-FLUSH_S = 300.0  # timeout for all replicas together: a forward pass and a copy of the weights
+RANK_WAIT_SHARE = 0.4
+"""Share of ``launch.stall_s`` for which a rank waits for the others: below 1, so that the loss of a rank is
+raised here before the driver gives this process up."""
+APPLIED_S = 300.0  # timeout for all replicas together: a forward pass and a copy of the weights
 ASK_S = 10.0  # how long a replica's question for newer weights waits before it is answered with nothing
 
 
@@ -109,7 +111,7 @@ class TrainerWorker:
             self._update.learn_states_in(world_model, settings.timeout_s)
         self._online = online
         self._lock = threading.Lock()
-        self._kept: Any = None
+        self._copied: Any = None
         self._in_turn = False
         self._publisher = WeightPublisher(readers, ray.put)
         self._history: deque[Metrics] = deque()  # filled on one thread, emptied on another
@@ -127,20 +129,20 @@ class TrainerWorker:
             self._publish()
         self._train(replay)
         self._clock.enter(WEIGHT_SYNC)
-        self._publisher.flush()
+        self._publisher.wait_until_applied()
         self._clock.enter(WAIT_IN)
         return self._update.version
 
-    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
-        """The newest weights for a replica that has applied `version`; see `WeightPublisher`."""
-        return self._publisher.newer_than(reader, version)
+    def next_weights(self, reader: str, applied: int) -> tuple[int, list[Any]]:
+        """See `WeightPublisher.next_weights`."""
+        return self._publisher.next_weights(reader, applied)
 
     def _train(self, replay: Any) -> None:
         """Until the last update: take the batch, ask for the next one, step, publish."""
         decisions = self._config.batch_decisions
         updates = self._config.updates
         upcoming = replay.sample.remote(decisions, self._update.version)
-        asked = time.monotonic()
+        idle_since = time.monotonic()
         while self._update.version < updates:
             batch = upcoming
             self._clock.enter(WAIT_IN)
@@ -149,16 +151,17 @@ class TrainerWorker:
             segments = ray.get(batch)
             if not segments:
                 break
-            waited = time.monotonic() - asked
+            waited = time.monotonic() - idle_since
             if self._online is not None:
                 self._online.learn.remote(batch)
             if self._update.version + 1 < updates:
-                # Drawn early: it is learned from one update later, and its lag counts there.
+                # It is learned from after the update below, so its lag is checked against one version more.
                 upcoming = replay.sample.remote(decisions, self._update.version + 1)
-            self._clock.enter(CHECKPOINT)  # only `hold` keeps the lock from this thread
+            # If the lock is taken, `copy_state` has it, and waiting for it is time of the checkpoint.
+            self._clock.enter(CHECKPOINT)
             with self._lock:
                 self._step(batch, segments, waited)
-            asked = time.monotonic()
+            idle_since = time.monotonic()
             replay.learnt.remote()
 
     def _step(self, batch: Any, segments: list[Segment], waited: float) -> None:
@@ -172,7 +175,7 @@ class TrainerWorker:
         self._clock.enter(WEIGHT_SYNC)
         self._publish()
         if self._in_turn:
-            self._publisher.flush()
+            self._publisher.wait_until_applied()
         metrics["update"] = float(self._update.version)
         metrics["wait_s"] = waited
         metrics["update_s"] = updated - started
@@ -195,21 +198,21 @@ class TrainerWorker:
         """Take turns with rollout workers from now on, unless the schedule is asynchronous."""
         self._in_turn = schedule != ASYNCHRONOUS
 
-    def hold(self) -> tuple[int, list[Metrics]]:
-        """Keeps a copy of all that is to be saved, as it is between two updates, for `write`.
+    def copy_state(self) -> tuple[int, list[Metrics]]:
+        """Copies all that `write` is to save, as it is between two updates.
 
-        Returns its version, and the records up to it that `metrics` has not given.
+        Returns its version, and the records up to it, which `metrics` will not return again.
         """
         with self._lock:
             with self._peers.gathering("gather_state"):
                 adapter = self._update.adapter
-                self._kept = adapter.copy_weights(), adapter.export_trainable(), self._update.state()
+                self._copied = adapter.copy_weights(), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()
 
     def write(self, directory: Path) -> None:
-        """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
-        weights, trained, state = self._kept
-        self._kept = None
+        """Writes what `copy_state` has copied: ``pretrained_model`` and its part of ``training_state``."""
+        weights, trained, state = self._copied
+        self._copied = None
         fault_point("trainer.write")
         self._update.adapter.save(directory / PRETRAINED, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
@@ -223,7 +226,7 @@ class WeightPublisher:
     applied the one before, so a slow replica skips versions and the trainer waits for none.
 
     Args:
-        readers: names of the replicas that `flush` waits for.
+        readers: names of the replicas that `wait_until_applied` waits for.
         put: copies tensors into the store; returns the reference that replicas get.
     """
 
@@ -242,20 +245,20 @@ class WeightPublisher:
             self._reference = reference
             self._changed.notify_all()
 
-    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
-        """Note that a replica has applied a version; returns the newest one and its reference.
+    def next_weights(self, reader: str, applied: int) -> tuple[int, list[Any]]:
+        """Note that a replica has applied this version, and wait for a newer one: it and its reference.
 
         The list is empty if there was none within `ASK_S`. Ray would replace a reference outside of a list by
         the tensors.
         """
         with self._changed:
-            self._applied[reader] = version
+            self._applied[reader] = applied
             self._changed.notify_all()
-            if not self._changed.wait_for(lambda: self.version > version, ASK_S):
-                return version, []
+            if not self._changed.wait_for(lambda: self.version > applied, ASK_S):
+                return applied, []
             return self.version, [self._reference]
 
-    def flush(self, timeout_s: float = FLUSH_S) -> None:
+    def wait_until_applied(self, timeout_s: float = APPLIED_S) -> None:
         """Wait until every replica has applied the newest set."""
 
         def late() -> list[str]:
@@ -303,7 +306,7 @@ class Peers:
             ray.get(calls, timeout=self._timeout_s)
 
     def gathering(self, method: str) -> AbstractContextManager[None]:
-        """As `joining`, for work of all ranks only where each keeps a part of the weights."""
+        """As `joining`, where each rank keeps a part of the weights; else the first rank works alone."""
         if self._config.zero:
             return self.joining(method)
         return nullcontext()
@@ -347,11 +350,11 @@ class TrainerRank:
         self._update.step(segments)
 
     def gather_weights(self) -> None:
-        """Its part of the trainable weights, for the first rank to export."""
+        """Takes part in what the first rank calls to collect the trainable weights."""
         self._adapter.export_trainable()
 
     def gather_state(self) -> None:
-        """Its part of all that is saved, in the order in which the first rank asks for it."""
+        """Takes part in what the first rank calls to collect all that is saved, in its order."""
         self._adapter.copy_weights()
         self._adapter.export_trainable()
         self._update.state()

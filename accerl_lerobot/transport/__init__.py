@@ -286,9 +286,9 @@ class Endpoint:
 class ReconnectingClient:
     """Connects again to a service that was lost, or to its successor, and asks what has not been answered.
 
-    For services without a state of their own: a request for a decision carries its noise, and the decision
-    the version of its weights. While the service is away no replies come and nothing fails. Messages must not
-    change until they are answered.
+    For services without a state of their own: a request for a decision carries the seed of its noise, and the
+    decision the version of its weights. While the service is away no replies come and nothing fails. Messages
+    must not change until they are answered.
     """
 
     def __init__(self, endpoint: Endpoint) -> None:

@@ -38,7 +38,7 @@ from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
 from accerl_lerobot.policies.config import executed_rows
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.untrusted import refusing
-from accerl_lerobot.rollout.runner import Starts, start_of
+from accerl_lerobot.rollout.runner import FirstObservations, start_of
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
@@ -160,22 +160,22 @@ class ImaginedEnvironment(Environment):
     """An environment of a world model's predictions, with the real environment's spec.
 
     Args:
-        starts: tasks and first observations of real episodes.
+        first: tasks and first observations of real episodes.
     """
 
     source = IMAGINED
 
-    def __init__(self, world: World, spec: EnvironmentSpec, starts: Starts) -> None:
+    def __init__(self, world: World, spec: EnvironmentSpec, first: FirstObservations) -> None:
         self.spec = spec
         self._world = world
-        self._starts = starts
+        self._first = first
         self._task = ""
         self._seed = 0
         self._steps = 0
         self._state: State = {}
 
     def reset(self, seed: int, task: str) -> Observation:
-        _, first = start_of(self._starts, seed)
+        _, first = start_of(self._first, seed)
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         [frames], [robot] = model_arrays(arrays, self._world.model.spec)
         self._task = str(first[TASK])
@@ -230,11 +230,11 @@ def world_of(config: ImaginationConfig) -> World:
 
 
 def imagined_environments(
-    config: ImaginationConfig, count: int, spec: EnvironmentSpec, starts: Starts
+    config: ImaginationConfig, count: int, spec: EnvironmentSpec, first: FirstObservations
 ) -> tuple[World, list[Environment]]:
     """The world of a run, and so many environments in it; `spec` is the real environment's."""
     world = world_of(config)
-    return world, [ImaginedEnvironment(world, spec, starts) for _ in range(count)]
+    return world, [ImaginedEnvironment(world, spec, first) for _ in range(count)]
 
 
 @contextmanager

@@ -183,7 +183,7 @@ class TestActing:
             np.testing.assert_allclose(decision.chunk, expected, atol=1e-6)
 
     def test_its_noise_belongs_to_the_request(self, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setattr(teacher_module, "SHARE", 1.0)
+        monkeypatch.setattr(teacher_module, "ACTING_SHARE", 1.0)
         spec, observation = StateSpec({}, 4, STATE_SIZE, (4, 2)), make_environment(ENV).reset(0, "match")
         teacher = Teacher(SimulatorState(spec, SimulatorStateConfig()), chunk=(4, 2))
         teacher.ready.fill_(1)

@@ -59,16 +59,16 @@ class CountingAdapter:
 class Trainer:
     def __init__(self) -> None:
         self._publisher = WeightPublisher(["inference"], put=lambda tensors: tensors)
-        self.newer_than = SimpleNamespace(remote=self._newer_than)
+        self.next_weights = SimpleNamespace(remote=self._next_weights)
 
     def publish(self, version: int) -> None:
         self._publisher.publish(version, {"w": version})
 
-    async def flush(self) -> None:
-        await asyncio.to_thread(self._publisher.flush, HANGS_S)
+    async def wait_until_applied(self) -> None:
+        await asyncio.to_thread(self._publisher.wait_until_applied, HANGS_S)
 
-    async def _newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
-        found, references = await asyncio.to_thread(self._publisher.newer_than, reader, version)
+    async def _next_weights(self, reader: str, version: int) -> tuple[int, list[Any]]:
+        found, references = await asyncio.to_thread(self._publisher.next_weights, reader, version)
         return found, [asyncio.sleep(0, tensors) for tensors in references]
 
 
@@ -121,7 +121,7 @@ def test_no_batch_sees_two_versions(play):
                 while adapter.batches < version:
                     await asyncio.sleep(0.0002)
                 trainer.publish(version)
-                await trainer.flush()
+                await trainer.wait_until_applied()
 
         async def decide() -> list[Decision]:
             answers: list[Decision] = []
@@ -146,7 +146,7 @@ def test_a_process_that_comes_later_is_ready_with_the_newest_weights(play):
         assert [decision.version for decision in await ask(worker)] == [3, 3]
         await worker.follow(trainer)
         trainer.publish(4)
-        await trainer.flush()
+        await trainer.wait_until_applied()
         assert adapter.loaded == [3, 4]
 
     play(scene)

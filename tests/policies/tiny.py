@@ -62,7 +62,7 @@ def refused(path: Path | str, why: str, **options: Any) -> None:
 def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
     """Plays requests as one episode, in which each decision is made alone; it has been through a pickle."""
     plan = EpisodePlan(task="task", seed=0, explore=True)
-    episode = ActiveEpisode(plan, 100, [asked[0].observation])
+    episode = ActiveEpisode(plan=plan, time_limit=100, observations=[asked[0].observation])
     for i in range(length):
         decision = adapter.decide([asked[i]], 3)[0]
         episode.add(decision, decision.chunk, 0.0, 3, asked[i + 1].observation)

@@ -90,7 +90,7 @@ class Recorder:
     def play(self) -> list[Request]:
         """Runs all plans, slot by slot in turn; all requests that were made."""
         made: list[Request] = []
-        due = {slot: self.runner.start(slot) for slot in range(len(self.runner))}
+        due = {slot: self.runner.begin_episode(slot) for slot in range(len(self.runner))}
         while any(due.values()):
             for slot, request in due.items():
                 if request is not None:

@@ -41,7 +41,7 @@ def test_an_episode_is_cut_into_segments_without_a_gap():
 
 def test_a_result_has_the_totals_of_its_episode_and_the_oldest_and_newest_weights():
     recorder = Recorder([ScriptedEnvironment(steps=2 * CHUNK + 1)], [explore()], CONFIG)
-    request = recorder.runner.start(0)
+    request = recorder.runner.begin_episode(0)
     for version in (4, 3, 5):
         request = recorder.runner.advance(0, decide(request, version))
     (result,), (segment,), counters = recorder.results, recorder.segments, recorder.runner.counters
@@ -70,7 +70,7 @@ def test_every_decision_costs():
 
 def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episode():
     begun = Recorder([ScriptedEnvironment(steps=9)], [explore()], CONFIG).runner
-    begun.advance(0, decide(begun.start(0)))
+    begun.advance(0, decide(begun.begin_episode(0)))
     state = begun.state()
     environment = ScriptedEnvironment(steps=9)
     resumed = Recorder([environment], [], CONFIG).runner
@@ -197,7 +197,7 @@ def test_not_even_where_the_one_before_has_played_thousands():
         plans = make(incarnation=incarnation)
         said = count - 30  # the last episodes were begun after it had been asked
         seeds = {plan.seed for plan in take(plans, max(0, said))}
-        starts = plans.starts
+        starts = plans.seeds_used
         seeds |= {plan.seed for plan in take(plans, min(count, 30))}
         assert len(seeds) == count and not seeds & seen
         seen |= seeds

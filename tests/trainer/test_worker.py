@@ -57,7 +57,7 @@ def test_it_makes_its_updates_publishes_each_and_draws_no_batch_more(monkeypatch
     records = stage.worker.metrics()
     assert [r["update"] for r in records] == [1, 2, 3, 4, 5, 6] and stage.worker.metrics() == []
     assert all(r["wait_s"] >= 0 and r["update_s"] > 0 and r["publish_s"] >= 0 for r in records)
-    version, (newest,) = stage.worker.newer_than("inference", -1)
+    version, (newest,) = stage.worker.next_weights("inference", -1)
     assert version == 6 and newest is stage.published[-1] and len(stage.published) == 7
     last = stage.worker._update.adapter.export_trainable()
     assert any(not np.array_equal(stage.published[0][name], last[name]) for name in last)
@@ -87,7 +87,7 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
         threading.Event().wait(0.001)
     saved = []
     for i in range(8):
-        saved.append(stage.worker.hold())
+        saved.append(stage.worker.copy_state())
         stage.worker.write(tmp_path / str(i))
     stage.batches = 0
     runner.join()

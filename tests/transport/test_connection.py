@@ -246,22 +246,22 @@ def test_a_replica_gets_the_newest_set_and_waits_for_a_newer_one_not_for_ever(mo
         tensor[:] = version
         publisher.publish(version, {"w": tensor})
     tensor[:] = -1
-    version, (newest,) = publisher.newer_than("inference", -1)
+    version, (newest,) = publisher.next_weights("inference", -1)
     assert version == 4 and (newest["w"] == 4).all()
     threading.Timer(0.05, publisher.publish, (5, {})).start()
-    assert publisher.newer_than("inference", 4) == (5, [{}])
+    assert publisher.next_weights("inference", 4) == (5, [{}])
     monkeypatch.setattr(worker, "ASK_S", 0.01)
-    assert publisher.newer_than("inference", 5) == (5, [])
+    assert publisher.next_weights("inference", 5) == (5, [])
 
 
 def test_flush_waits_until_each_replica_has_applied_the_newest(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(worker, "ASK_S", 0.0)
     publisher = WeightPublisher(["inference 0", "inference 1"], copy.deepcopy)
-    publisher.flush(30)
+    publisher.wait_until_applied(30)
     publisher.publish(1, {})
-    publisher.newer_than("inference 0", 1)
-    publisher.newer_than("inference 1", 0)
+    publisher.next_weights("inference 0", 1)
+    publisher.next_weights("inference 1", 0)
     with pytest.raises(TimeoutError, match=r"weights not applied within 0\.1 s by inference 1"):
-        publisher.flush(0.1)
-    threading.Timer(0.05, publisher.newer_than, ("inference 1", 1)).start()
-    publisher.flush(30)
+        publisher.wait_until_applied(0.1)
+    threading.Timer(0.05, publisher.next_weights, ("inference 1", 1)).start()
+    publisher.wait_until_applied(30)

@@ -33,7 +33,7 @@ def real_episode(seed: int, *, solve_at: int = 99) -> Segment:
     """An episode of random chunks, which are right from decision `solve_at` on."""
     environment: Any = make_environment(WORLD)
     recorder = Recorder([environment], [explore(seed, "match")], RolloutConfig(segment_length=99))
-    rng, made, due = np.random.default_rng(seed), 0, recorder.runner.start(0)
+    rng, made, due = np.random.default_rng(seed), 0, recorder.runner.begin_episode(0)
     while due is not None:
         chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)
         if made >= solve_at:
