@@ -4,6 +4,7 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from tests.tiny_datasets import labels, record_dataset, write_dataset
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
 K, COST = 4, 0.25
+GIVEN: dict[str, Any] = {"instructions": (), "reward": "success", "decision_cost": COST}
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,7 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
     data = LeRobotDataset("a/b", root=dataset.root)
     ends = zip(*(data.meta.episodes[f"dataset_{end}_index"] for end in ("from", "to")), strict=True)
     episodes = [[data[i] for i in range(first, last)] for first, last in ends]
-    read = list(demonstrations(dataset, COST, like))
+    read = list(demonstrations(dataset, like, **GIVEN))
     expected = [(frames, phase) for frames in episodes for phase in range(min(K, len(frames)))]
     for segment, (frames, phase) in zip(read, expected, strict=True):
         won = any(bool(frame["next.success"]) for frame in frames)
@@ -96,7 +98,7 @@ def test_labels_of_an_episode(label: dict[str, list[int]], rewards: list[int], s
         lambda name, episode, step: [label[name][step]] if name in label else None,
     )  # fmt: skip
     shapes = {"observation.state": (4,), "action": (2,)}
-    (segment,) = recorded(dataset, open_metadata(dataset), shapes, 1, 100, 1, time_limit=100)
+    (segment,) = recorded(dataset, open_metadata(dataset), shapes, 1, range(1), time_limit=100)
     assert (segment.reward.tolist(), segment.success, segment.task) == (rewards, success, "go")
     assert segment.observations["observation.state"].shape == (len(rewards) + 1, 4)
 
@@ -104,17 +106,47 @@ def test_labels_of_an_episode(label: dict[str, list[int]], rewards: list[int], s
 def test_of_a_long_dataset_only_a_part_is_read(dataset: DatasetConfig, like: Segment, monkeypatch):
     frames = open_metadata(dataset).total_frames
     monkeypatch.setattr(module, "ROWS", frames // K // 2)
-    read = list(demonstrations(dataset, COST, like))
+    read = list(demonstrations(dataset, like, **GIVEN))
     assert len(read) == 2 and sum(map(len, read)) <= frames // K // 2 + 2
+
+
+def test_of_each_task_of_the_run_as_large_a_share_is_read(like: Segment, tmp_path: Path, monkeypatch, caplog):
+    texts = ("a", "a", "a", "a", "b", "b", "c", "b", "b")
+    dataset = write_dataset(tmp_path / "data", texts)
+    like = replace(like, observations={"observation.state": like.observations["observation.state"]})
+
+    def read(*instructions: str, reward: str = "success") -> list[tuple[str, int]]:
+        given = GIVEN | {"instructions": instructions, "reward": reward}
+        found = demonstrations(dataset, like, **given)
+        return [(segment.task, segment.origin.seed) for segment in found if not segment.before]
+
+    assert read("b", "a", "d") == [(texts[i], i) for i in (0, 1, 2, 3, 4, 5, 7, 8)]
+    assert "8 of 9 demonstrations join the memory" in caplog.text
+    assert read() == [(like.task, i) for i in range(9)], "the environment has no text"
+    monkeypatch.setattr(module, "FRAMES", 24)
+    assert read("b", "a") == [(texts[i], i) for i in (0, 1, 4, 5)]
+    assert read("d") == []
+
+
+def test_rewards_and_ends_are_those_of_the_environment(like: Segment, tmp_path: Path):
+    given: dict[str, Any] = {"next.success": [0, 0, 1, 1, 0, 0], "next.reward": [1, 2, 3, 4, 5, 6]}
+    dataset = write_dataset(
+        tmp_path / "data", ("go",), {"next.success": labels(), "next.reward": labels("float32")},
+        lambda name, episode, step: [given[name][step]] if name in given else None,
+    )  # fmt: skip
+    like = replace(like, observations={"observation.state": like.observations["observation.state"]})
+    for reward, expected in (("success", [1 - COST]), ("env", [10 - COST, 11 - COST])):
+        first = next(demonstrations(dataset, like, **GIVEN | {"reward": reward}))
+        assert first.success and first.reward.tolist() == expected
 
 
 def test_the_memory_begins_with_them_and_is_restored_without(dataset, like: Segment, tiny_checkpoint: Path):
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     adapter = with_teacher(load_adapter, SimulatorStateConfig(), 5, policy)  # numbers of its state
-    adapter.demonstrations = partial(demonstrations, dataset, COST)
+    adapter.demonstrations = partial(demonstrations, dataset, **GIVEN)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
-    rows = sum(map(len, demonstrations(dataset, COST, like)))
+    rows = sum(map(len, demonstrations(dataset, like, **GIVEN)))
     assert update.step([like])["memory_decisions"] == rows + 1
     assert update.memory["success"][:-1].any() and not update.memory["success"][-1]
     again = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)

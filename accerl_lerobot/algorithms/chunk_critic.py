@@ -212,7 +212,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def _learn_to_act(self, new: int) -> Metrics:
         won = np.flatnonzero(self.memory["success"])
-        # Without a success there is nothing to learn: the teacher would follow the critic's noise.
+        # Without a success there is nothing to learn: the teacher would follow the critic's noise. So it
+        # would in a task without one, see `imitable`.
         if self.version < self.config.value_warmup_updates or not len(won):
             return {}
         self._scale_states()
@@ -226,11 +227,15 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         critic_steps = self.steps("critic", each, new)
         metrics = mean(self._critic_step(bounds) for _ in critic_steps)
         teacher_steps = self.steps("teacher", each / 2, new)
-        metrics |= mean(self._teacher_step(won) for _ in teacher_steps)
+        rows = self.imitable()
+        metrics |= mean(self._teacher_step(rows, won) for _ in teacher_steps)
         return metrics | super().learn(new)
 
-    def imitable(self) -> np.ndarray:  # the teacher labels every observation
-        return np.arange(len(self.memory))
+    def imitable(self) -> np.ndarray:
+        """Rows of the tasks that have been achieved, whose observations the teacher labels."""
+        tasks = self.memory["task"]
+        achieved = np.unique(tasks[self.memory["success"]])
+        return np.flatnonzero(np.isin(tasks, achieved))
 
     @torch.no_grad()
     def target(self, rows: np.ndarray) -> Tensor:
@@ -305,7 +310,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def _critic_step(self, bounds: tuple[float, float]) -> Metrics:
         """One gradient step of the ensemble; ``bounds`` of the returns seen, which no target leaves."""
-        rows = drawn(self.imitable(), BATCH)
+        rows = drawn(np.arange(len(self.memory)), BATCH)
         state = self.tensor("state", rows)
         chunk = self.tensor("chunk", rows)
         reward = self.tensor("reward", rows)
@@ -336,13 +341,12 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             "explained_variance": float(1 - unexplained),
         }
 
-    def _teacher_step(self, won: np.ndarray) -> Metrics:
-        """One gradient step of the teacher; `won` are the rows of successful episodes."""
-        state = self.tensor("state", drawn(self.imitable(), BATCH))
-        rows = drawn(won, BATCH)
+    def _teacher_step(self, rows: np.ndarray, won: np.ndarray) -> Metrics:
+        """One gradient step of the teacher along the critic in `rows`, and towards the successes `won`."""
+        state = self.tensor("state", drawn(rows, BATCH))
         with self.adapter.autocast():
             q = self.critic(self.teacher.scaled(state), self.teacher(state))
-            gap = self._gap(rows)
+            gap = self._gap(drawn(won, BATCH))
         scale = q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
         loss = -pessimistic(q).mean() / scale
         distance = gap.square().mean() / DISTANCE**2

@@ -132,6 +132,7 @@ class OffPolicyUpdate(BaseUpdate):
     """
 
     n_step = 1  # decisions after which a target bootstraps
+    has_value = False  # True if steps of the policy train a critic too, alone during the warm-up
 
     adapter: LeRobotAdapter | StockAdapter
 
@@ -163,19 +164,19 @@ class OffPolicyUpdate(BaseUpdate):
         return metrics
 
     def learn(self, new: int) -> Metrics:
-        """Makes the steps that so many new decisions allow; none before ``value_warmup_updates``."""
+        """Makes the steps that so many new decisions allow, of a critic alone in ``value_warmup_updates``."""
         start = self.config.value_warmup_updates
         lr = self.config.lr * self.lr_share(start)
         self.optimizer.param_groups[0]["lr"] = lr
         metrics = {"lr": lr}
         rows = self.imitable()
-        if self.version >= start and len(rows):
+        if len(rows) and (self.version >= start or self.has_value):
             steps = self.steps("policy", self.algorithm.policy_steps, new)
             metrics |= mean(self._policy_step(rows) for _ in steps)
         return metrics
 
     def imitable(self) -> np.ndarray:
-        """Rows of the memory that the policy imitates, and from which a critic's batches are drawn."""
+        """Rows of the memory that the policy imitates."""
         return np.flatnonzero(self.memory["success"])
 
     def target(self, rows: np.ndarray) -> Tensor:
@@ -235,6 +236,9 @@ class OffPolicyUpdate(BaseUpdate):
             torch.stack(list(losses.values())).sum().backward()
             for name, value in losses.items():
                 metrics[name] = metrics.get(name, 0.0) + float(value.detach())
+        if self.version < self.config.value_warmup_updates:
+            for parameter in self._policy:
+                parameter.grad = None
         loss = sum(metrics.values())
         norm = torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip)
         self.apply(self.optimizer, "a step of the policy", loss, float(norm))
@@ -245,6 +249,8 @@ class OffPolicyUpdate(BaseUpdate):
 
 class AWRUpdate(OffPolicyUpdate):
     """Advantage-weighted regression, see `AWRConfig`; the critic is the adapter's."""
+
+    has_value = True
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: AWRConfig, config: TrainerConfig) -> None:
         super().__init__(adapter, algorithm, config)

@@ -45,6 +45,7 @@ class FlowShape:
     executed: int  # rows that are executed in the environment, ≤ K (LeRobot's n_action_steps)
     padded_dim: int  # D, LeRobot's max_action_dim
     action_dim: int  # A real dims
+    causal: bool = False  # True if no row depends on later ones
 
     def executed_part(self, x: Tensor) -> Tensor:
         """The executed entries (B, L, A) of (B, K, D)."""
@@ -66,7 +67,7 @@ class FlowModel(Model):
     shape: FlowShape
 
 
-def flow_shape(config: Any, num_steps: int) -> FlowShape:
+def flow_shape(config: Any, num_steps: int, causal: bool = False) -> FlowShape:
     """The sizes in a LeRobot flow policy's config."""
     return FlowShape(
         num_steps=num_steps,
@@ -74,6 +75,7 @@ def flow_shape(config: Any, num_steps: int) -> FlowShape:
         executed=config.n_action_steps,
         padded_dim=config.max_action_dim,
         action_dim=config.action_feature.shape[0],
+        causal=causal,
     )
 
 
@@ -112,16 +114,22 @@ class FlowFamily(NoiseFamily):
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
-        """Flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
+        """Flow matching at a time from LeRobot's Beta(1.5, 1).
+
+        The last action stands for those after it, as at the end of an episode in LeRobot's training. These
+        rows count where executed ones depend on them.
+        """
+        rows = torch.arange(self.shape.chunk_size).clamp(max=self.shape.executed - 1)
         target = chunk.new_zeros(len(chunk), self.shape.chunk_size, self.shape.padded_dim)
-        self.shape.executed_part(target).copy_(chunk)
+        target[..., : self.shape.action_dim] = chunk[:, rows]
         noise = torch.randn_like(target)
         times = torch.distributions.Beta(1.5, 1.0).sample((len(chunk),))
         t = times.to(chunk) * 0.999 + 0.001
         share = t[:, None, None]
         mixed = share * noise + (1 - share) * target
         error = encoded.context(mixed, t) - (noise - target)
-        return self.shape.executed_part(error).square().mean((1, 2))
+        counted = self.shape.executed if self.shape.causal else self.shape.chunk_size
+        return error[:, :counted, : self.shape.action_dim].square().mean((1, 2))
 
     def _std(self, like: Tensor) -> Tensor:
         return like.new_full((), self.sampler.noise_level)

@@ -204,7 +204,7 @@ def load_adapter(
         if isinstance(sampler, ChunkNoiseConfig):
             stock = StockAdapter(policy, processing, checkpoint.precision, sampler)
             tune(policy, config.tuning, checkpoint.model_class.backbone)
-            stock.self_check()
+            stock.self_check(dry_run)
             return stock
         model = checkpoint.model_class(policy)
         family = imported(sampler.family)(model, sampler)

@@ -88,14 +88,20 @@ class StockAdapter(PretrainedAdapter):
         finally:
             self.policy.eval()
 
-    def self_check(self) -> None:
+    def self_check(self, dry_run: bool) -> None:
         """Proves that the policy can be asked twice for a chunk, and that its training loss can be computed.
 
+        In a `dry_run` its buffers are not the checkpoint's.
+
         Raises:
-            InputError: it answers the same question differently, is trained on more than its chunks, or its
-                preprocessor does not undo what its postprocessor does to actions.
+            InputError: it answers the same question differently, is trained on more than its chunks, learns
+                more than weights, or its preprocessor does not undo what its postprocessor does to actions.
         """
         config = self.policy.config
+        averaged = getattr(config, "temporal_ensemble_coeff", None)
+        if averaged is not None:
+            hint = "actions averaged over earlier chunks are not learned; set it to null in config.json"
+            raise InputError("policy.temporal_ensemble_coeff", averaged, hint)
         coarse = sum(tensor.dtype == torch.bfloat16 for tensor in self.trainable().values())
         if coarse:
             why = "steps that are small beside a weight are lost"
@@ -128,8 +134,10 @@ class StockAdapter(PretrainedAdapter):
         buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
         with torch.no_grad(), torch.random.fork_rng(), self.autocast():
             self.imitate(*stack_observations(requests), chunk)
-            for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
-                buffer.copy_(buffers[name])
+        for name, buffer in self.policy.named_buffers():
+            if not dry_run and not torch.equal(buffer, buffers[name]):
+                why = f"its training moves {name}, which is no weight: vqbet finishes its codebook first"
+                raise self._unable(f"{why} (n_vqvae_training_steps), in SFT")
 
     def _check_targets(self, requests: Sequence[Request], zeros: Tensor) -> None:
         """Refuses a policy that would be trained on other chunks (B, K, A) than it is told to imitate."""

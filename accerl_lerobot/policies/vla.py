@@ -98,7 +98,7 @@ class SmolVLA(FlowModel):
         if policy.config.adapt_to_pi_aloha:
             hint = "not supported in RL; train one without it"
             raise NoDensityError("policy.adapt_to_pi_aloha", True, hint)
-        self.shape = flow_shape(policy.config, policy.config.num_steps)
+        self.shape = flow_shape(policy.config, policy.config.num_steps, causal=True)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,9 @@ logger = logging.getLogger(__name__)
 
 ROWS, FRAMES = 5000, 20_000
 """Decisions, and env steps, that are read at most; of short datasets, decisions that begin at every step."""
+
+SUCCESS_ALONE = "success"
+"""``env.reward`` of environments that pay 1 for success, and of those that have no other reward."""
 
 Reader = Callable[[Segment], Iterator[Segment]]
 """Reads demonstrations with the names and shapes of an explored segment, see `demonstrations`."""
@@ -62,8 +65,11 @@ def make_adapter(
     return adapter
 
 
-def demonstrations_of(config: RunConfig) -> Reader | None:
-    """The dataset that the run was given, or has recorded; None without one, or if nothing remembers it."""
+def demonstrations_of(config: RunConfig, instructions: tuple[str, ...]) -> Reader | None:
+    """The dataset that the run was given, or has recorded; None without one, or if nothing remembers it.
+
+    `instructions` are the texts of the environment's tasks; empty: it has none.
+    """
     if not isinstance(config.algorithm, OffPolicyConfig):
         return None
     dataset = config.dataset
@@ -75,7 +81,13 @@ def demonstrations_of(config: RunConfig) -> Reader | None:
         root = str(config.folder / DEMOS)
     elif root is not None:
         root = str(Path(root).expanduser().absolute())
-    return partial(demonstrations, replace(dataset, root=root), config.rollout.decision_cost)
+    return partial(
+        demonstrations,
+        replace(dataset, root=root),
+        instructions=instructions,
+        reward=getattr(config.env, "reward", SUCCESS_ALONE),
+        decision_cost=config.rollout.decision_cost,
+    )
 
 
 def unlike(meta: Any, wanted: Shapes) -> str | None:
@@ -92,12 +104,14 @@ def unlike(meta: Any, wanted: Shapes) -> str | None:
     return None
 
 
-def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) -> Iterator[Segment]:
+def demonstrations(
+    dataset: DatasetConfig, like: Segment, *, instructions: tuple[str, ...], reward: str, decision_cost: float
+) -> Iterator[Segment]:
     """Reads whole episodes, each up to ``like.actions.shape[1]`` times: from its first step, its second, ….
 
-    Rewards are ``next.reward``, or 1 for success, less `decision_cost` for each decision. An episode ends
-    with its success; one without labels is a success as a whole. Names and shapes are those of `like`, an
-    explored episode; a dataset of others is not read, which is logged.
+    Names and shapes are those of `like`, an explored episode; a dataset of others is not read, which is
+    logged. Episodes of other `instructions` are left out; without any, all are of the task of `like`. For
+    `reward` see `recorded`.
     """
     meta = open_metadata(dataset)
     wanted = {name: rows.shape[1:] for name, rows in like.observations.items()}
@@ -107,7 +121,37 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
         return
     chunk = like.actions.shape[1]
     most = min(ROWS, FRAMES // chunk)
-    yield from recorded(dataset, meta, wanted, chunk, most, ROWS, like.time_limit, decision_cost)
+    episodes, frames = some_of_each_task(meta, instructions, most * chunk)
+    if len(episodes) < meta.total_episodes:
+        why = f"the others are of other tasks, or more than {most} decisions"
+        logger.warning("%d of %d demonstrations join the memory: %s", len(episodes), meta.total_episodes, why)
+    if not episodes:
+        return
+    phases = min(chunk, max(1, ROWS * chunk // frames))
+    for segment in recorded(
+        dataset, meta, wanted, chunk, episodes, like.time_limit, phases, reward, decision_cost
+    ):
+        if not instructions:
+            segment = replace(segment, task=like.task)
+        yield segment
+
+
+def some_of_each_task(meta: Any, instructions: tuple[str, ...], most: int) -> tuple[list[int], int]:
+    """Indices of some `most` frames' whole episodes, the same share of each task's, and the frames there are.
+
+    Without `instructions` all tasks count.
+    """
+    by_task: dict[str, list[int]] = {}
+    for episode, texts in enumerate(meta.episodes["tasks"]):
+        if not instructions or texts[0] in instructions:
+            by_task.setdefault(texts[0], []).append(episode)
+    lengths = meta.episodes["length"]
+    frames = sum(sum(lengths[episode] for episode in episodes) for episodes in by_task.values())
+    share = min(1.0, most / max(1, frames))
+    chosen: list[int] = []
+    for episodes in by_task.values():
+        chosen += episodes[: math.ceil(share * len(episodes))]
+    return sorted(chosen), frames
 
 
 def recorded(
@@ -115,19 +159,21 @@ def recorded(
     meta: Any,
     wanted: Shapes,
     chunk: int,
-    most: int,
-    enough: int,
+    episodes: Sequence[int],
     time_limit: int,
+    phases: int = 1,
+    reward: str = "",
     decision_cost: float = 0.0,
 ) -> Iterator[Segment]:
-    """Reads whole episodes as `demonstrations` does, in decisions of `chunk` env steps.
+    """Reads whole episodes of a dataset, in decisions of `chunk` env steps.
 
-    `wanted` are the shapes of the observations that are read and of ``action``, by name. `most` decisions are
-    of one reading of the dataset; it is read again, from second steps on, …, up to `enough` in all.
+    `wanted` are the shapes of the observations that are read and of ``action``, by name. Each episode is read
+    from its first step on, then from its second, …, so many `phases`.
+
+    Rewards are ``next.reward``, or 1 for success where `reward` is `SUCCESS_ALONE` or the dataset has none,
+    less `decision_cost` for each decision. An episode ends with its success, unless the run's environment has
+    another reward; one without labels is a success as a whole.
     """
-    phases = min(chunk, max(1, enough * chunk // meta.total_frames))
-    share = min(1.0, most * chunk / meta.total_frames)
-    episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
         images: list[str] = []
         vectors: dict[str, np.ndarray] = {}
@@ -137,12 +183,14 @@ def recorded(
             else:
                 vectors[name] = numbers(data, name, dataset).astype(np.float32)
         for episode in read_labels(data, dataset):
-            success = episode.success or episode.success_at is None
+            success_at = episode.success_at
+            success = episode.success or success_at is None
             end = len(episode.rows)
-            if episode.success_at is not None and episode.success_at >= 0:
-                end = episode.success_at + 1
+            labelled = success_at is not None
+            if success_at is not None and success_at >= 0 and reward in ("", SUCCESS_ALONE):
+                end = success_at + 1
             rewards = episode.rewards
-            if rewards is None:
+            if rewards is None or (labelled and reward == SUCCESS_ALONE):
                 rewards = np.zeros(end, np.float32)
                 rewards[-1] = success
             columns = observations(data, episode.rows[:end], vectors, images)
@@ -152,14 +200,14 @@ def recorded(
                 seen = [*starts, end - 1]
                 executed = starts[:, None] + np.arange(chunk)
                 t = len(starts)
-                reward = np.add.reduceat(rewards[:end], starts)
+                summed = np.add.reduceat(rewards[:end], starts)
                 yield Segment(
                     observations={name: rows[seen] for name, rows in columns.items()},
                     task=episode.tasks[0],
                     latent={},
                     log_prob=np.zeros((t, 0), np.float32),
                     actions=actions[np.minimum(executed, end - 1)],
-                    reward=reward - np.float32(decision_cost),
+                    reward=summed - np.float32(decision_cost),
                     version=np.zeros(t, np.int64),
                     steps=np.minimum(chunk, end - starts),
                     before=phase,

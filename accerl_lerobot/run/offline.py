@@ -143,7 +143,7 @@ def _remember(
     """Fill the memory from the dataset; returns the numbers of its episodes, successes and decisions."""
     from accerl_lerobot.algorithms.chunk_critic import LEAST_TRANSITIONS
     from accerl_lerobot.policies.config import executed_rows
-    from accerl_lerobot.run.adapter import recorded
+    from accerl_lerobot.run.adapter import recorded, some_of_each_task
 
     algorithm: Any = config.algorithm
     chunk = executed_rows(update.adapter.policy.config)
@@ -153,11 +153,13 @@ def _remember(
         size += math.prod(shape) * (1 if is_picture else 4)
     most = max(1, min(algorithm.memory, BYTES // size))
     longest = int(max(meta.episodes["length"]))
+    phases = min(chunk, max(1, most * chunk // meta.total_frames))
     outcomes: dict[int, bool] = {}  # episode → success
     totals: dict[int, float] = {}  # episode → reward of its first segment
     with console.stage("reading the dataset", total=meta.total_frames) as stage:
         frames = 0
-        for segment in recorded(config.dataset, meta, shapes, chunk, most, most, longest):
+        episodes, _ = some_of_each_task(meta, (), most * chunk)
+        for segment in recorded(config.dataset, meta, shapes, chunk, episodes, longest, phases):
             update.remember(segment)
             episode = segment.origin.seed
             outcomes[episode] = segment.success

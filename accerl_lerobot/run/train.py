@@ -160,7 +160,7 @@ def make_engine(
         config.algorithm,
         config.state_model,
         environment_state=history * spec.environment_state_dim,
-        remembered=demonstrations_of(config),
+        remembered=demonstrations_of(config, spec.instructions),
         load=load,
     )
     if config.launch.engine == "local":

@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -246,7 +247,7 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
         torch.testing.assert_close(new, old + 0.01 * (fast - old))
 
     won = np.arange(6)
-    metrics = update._teacher_step(won)
+    metrics = update._teacher_step(every, won)
     q = valued(update.critic, every, planned(every))
     gap = np.square(planned(won) - memory["chunk"][won]).mean() / 0.3**2
     gain = (q.mean(0) - q.std(0, ddof=1)).mean() / abs(q).mean()
@@ -315,17 +316,33 @@ def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
     assert "imitation_loss" in update.step([episode([0.0, 1.0])])
 
 
-def test_imitation_is_flow_matching():
-    """For the field that leads straight to the chunk the loss is 0; for one that is off by 1 it is 1."""
-    shape = FlowShape(num_steps=3, chunk_size=4, executed=3, padded_dim=5, action_dim=2)
+def test_a_task_without_a_success_is_not_taught(tiny_checkpoint: Path):
+    update = learner(tiny_checkpoint)
+    update.remember(episode([0.0, 1.0]))
+    update.remember(replace(episode([0.0, 0.0, 0.0]), task="Another task"))
+    update.remember(episode([0.0]))
+    assert update.imitable().tolist() == [0, 1, 5]
+    update.remember(replace(episode([1.0]), task="Another task"))
+    assert len(update.imitable()) == 7
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_imitation_is_flow_matching(causal: bool):
+    """For the field that leads straight to the chunk, padded with its last action, the loss is 0.
+
+    For one that is off by 1 in the row that is not executed it is a quarter, or 0 if that row does not count.
+    """
+    shape = FlowShape(num_steps=3, chunk_size=4, executed=3, padded_dim=5, action_dim=2, causal=causal)
     target = torch.zeros(64, 4, 5)
     target[:, :3, :2] = torch.randn(64, 3, 2)
+    target[:, 3] = target[:, 2]
     family = FlowFamily(SimpleNamespace(shape=shape), FlowSamplerConfig())
-    for off in (0.0, 1.0):
+    wrong = torch.tensor([0.0, 0.0, 0.0, 1.0])[:, None]
+    for off, expected in ((0.0, 0.0), (1.0, 1.0), (wrong, 0.0 if causal else 0.25)):
         velocity = lambda x, t, off=off: (x - target) / t[:, None, None] + off  # noqa: E731
         encoded = Encoded(features=torch.zeros(64, 1, 1), mask=torch.ones(64, 1), context=velocity)
         loss = family.imitation_loss(encoded, target[:, :3, :2])
-        torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
+        torch.testing.assert_close(loss, torch.full((64,), expected), atol=1e-3, rtol=1e-3)
 
 
 def first_action(update: OffPolicyUpdate) -> float:
@@ -409,7 +426,8 @@ def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
 
 
 def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: Path):
-    update = learning(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
+    algorithm = AWRConfig(policy_steps=1.0)
+    update = learning(tiny_checkpoint, algorithm, lr=1e-2, value_lr=3e-2, value_warmup_updates=60)
     before = update.adapter.export_trainable()
     update.remember(episode([0.0, 0.0, 1.0]))
     for _ in range(60):

@@ -177,7 +177,7 @@ def test_all_verbs_read_a_label_in_the_same_way(tmp_path: Path):
         lambda feature, episode, step: [rewards[episode][step]] if feature == REWARD else None,
     )  # fmt: skip
     shapes = {STATE: (4,), ACTION: (2,), FORCE: (1,)}
-    segments = list(recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1, 100))
+    segments = list(recorded(dataset, open_metadata(dataset), shapes, STEPS, range(4), 100))
     spec = WorldModelSpec(cameras=(FRONT,), image_size=(32, 32), state_dim=4, action_dim=2, chunk=2, fps=FPS)
     assert [segment.success for segment in segments] == [True, False, True, False]
     assert segments[0].observations[FORCE].shape[1:] == (1,), "LeRobot stores it without a dimension"

@@ -83,12 +83,19 @@ KINDS: dict[str, dict[str, Any]] = {
 FRONT, OF_TDMPC = "observation.images.front", "observation.image"  # LeRobot's TD-MPC knows its camera only
 
 
+def finish_codebook(policy: Any) -> None:
+    codebook = policy.vqbet.action_head.vqvae_model
+    codebook.discretized.fill_(True)
+    codebook.vq_layer.freeze_codebook.fill_(True)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     @cache
     def write(kind: str) -> Path:
         folder, camera = tmp_path_factory.mktemp(kind) / "policy", OF_TDMPC if kind == "tdmpc" else FRONT
-        return write_policy(folder, kind, image=64, camera=camera, **KINDS[kind])
+        prepare = finish_codebook if kind == "vqbet" else lambda policy: None
+        return write_policy(folder, kind, image=64, camera=camera, prepare=prepare, **KINDS[kind])
 
     return write
 
@@ -262,7 +269,7 @@ def test_exploring_is_the_chunk_and_noise_of_the_request(vqbet: Path):
     np.testing.assert_array_equal(noisy[2].chunk, adapter.decide(asked, 0)[2].chunk)
 
 
-write_vqbet = partial(write_policy, kind="vqbet", **KINDS["vqbet"])
+write_vqbet = partial(write_policy, kind="vqbet", prepare=finish_codebook, **KINDS["vqbet"])
 write_pi0, write_pi05 = partial(write_pi, kind="pi0"), partial(write_pi, kind="pi05")
 NEEDED = {write_wall_x: ("torchdiffeq", "qwen_vl_utils"), write_groot: ("tree",)}
 """Packages that some of LeRobot's policies need and that this package does not."""
@@ -413,6 +420,17 @@ def test_a_policy_that_takes_no_batch_decides_one_by_one(vqbet: Path, monkeypatc
     adapter = learning(vqbet)
     assert "vqbet policies decide for one environment at a time" in caplog.text
     assert len(adapter.decide(adapter.example_requests(), 0)) == 2
+
+
+def test_what_would_not_be_learned_is_refused(tmp_path: Path):
+    path = write_policy(tmp_path / "act", "act", image=64, **KINDS["act"])
+    with pytest.raises(
+        InputError, match="^policy.temporal_ensemble_coeff=0.1: actions averaged over earlier"
+    ):
+        learning(path)
+    unfinished = write_policy(tmp_path / "vqbet", "vqbet", image=64, **KINDS["vqbet"])
+    with pytest.raises(InputError, match="^policy.type='vqbet': its training moves vqbet.action_head.vqvae"):
+        learning(unfinished)
 
 
 def test_a_policy_that_changes_while_it_acts_is_refused(vqbet: Path, monkeypatch: pytest.MonkeyPatch):

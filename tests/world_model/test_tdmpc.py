@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's TD-MPC as a world model that critic and teacher stand on."""
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +81,15 @@ def test_it_learns_or_stays_as_it_is(written: Path):
 
 def test_what_does_not_fit_is_one_line(written: Path, tmp_path: Path):
     other = write_policy(tmp_path / "vqbet", "vqbet", image=64, camera=FRONT, **KINDS["vqbet"])
+    scaled = shutil.copytree(written, tmp_path / "scaled")
+    config = json.loads((scaled / "config.json").read_text())
+    config["normalization_mapping"]["VISUAL"] = "MEAN_STD"
+    (scaled / "config.json").write_text(json.dumps(config))
     for path, change, message in (
         (None, {}, "world_model.path=None: give the pretrained_model"),
         (str(tmp_path / "nowhere"), {}, "world_model.path="),
         (str(other), {}, "its type is vqbet; give one of type tdmpc"),
+        (str(scaled), {}, "its images are normalised by MEAN_STD; train it with IDENTITY"),
         (str(written), {"chunk": (3, 7)}, "action has 2 numbers there and 7 here"),
         (str(written), {"state": 9}, "observation.state has .* numbers there and 9 here"),
         (str(written), {"cameras": {"observation.images.a": 3, "observation.images.b": 3}}, "it sees observ"),
