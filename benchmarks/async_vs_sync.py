@@ -25,12 +25,12 @@ from rich.console import Group
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
+from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.latency import TRACE
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.simulated_environment import read_trace
-from benchmarks.tables import as_markdown, as_table, host, output_folder, ranged, spread, write
+from benchmarks.tables import as_markdown, as_table, drawing, host, output_folder, ranged, spread, write
 from benchmarks.throughput import ARMS, Block
 
 LEARNING = MachineryConfig(environments=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)

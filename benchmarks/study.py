@@ -53,10 +53,19 @@ from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engines import Progress, local
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation import Rate, drawing
+from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.config import Load, loader
-from benchmarks.tables import as_markdown, as_table, last_words, mean_interval, named, output_folder, write
+from benchmarks.tables import (
+    as_markdown,
+    as_table,
+    drawing,
+    last_words,
+    mean_interval,
+    named,
+    output_folder,
+    write,
+)
 
 NOTE = "intervals are 95 %, over policies where there are several"
 NUMBERS = ("episodes_explored", "env_steps", "updates", "lag_mean", "rl_s")

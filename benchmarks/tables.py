@@ -8,7 +8,8 @@ import math
 import os
 import platform
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -106,3 +107,15 @@ def write(
 def last_words(log: Path) -> str:
     """The end of a run's log."""
     return "\n".join(log.read_text(errors="replace").splitlines()[-LOG_LINES:])
+
+
+@contextmanager
+def drawing(path: Path) -> Iterator[Any]:
+    """Axes to draw on, with a grid, which are a PNG when the context is left."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), dpi=120, layout="tight")
+    axes = figure.subplots()
+    axes.grid(alpha=0.3)
+    yield axes
+    figure.savefig(path)

@@ -158,11 +158,10 @@ def test_what_goes_in_comes_out(tmp_path: Path):
     plain = {
         "plain": [None, True, -3, 0.1, "text", float("inf"), 2**100, np.float32(1.5)],
         "tuple": (1, ("a", [2.5]), SegmentStart("t", 3, 1)),
-        "by number": {0: "zero", (1, "b"): {"$": 1}, "empty": {}},
+        "dict": {"a": {"b": 1}, "empty": {}},
     }
     arrays = [np.zeros((2, 0), np.uint8), np.array(7), np.arange(6).reshape(2, 3)[:, ::2]]
-    rng = np.random.default_rng(4)
-    rng.random(5)
+    rng = np.random.default_rng(4).bit_generator.state
     segment = make_segment("a", n=3, version=[1, 2, 3], success=True)
     tensor = torch.arange(6.0).reshape(2, 3).T
     tree = plain | {"arrays": arrays, "segment": segment, "rng": rng, "tensor": tensor}
@@ -175,7 +174,7 @@ def test_what_goes_in_comes_out(tmp_path: Path):
     back["arrays"][2][0, 0] = 9  # the caller's own
     assert back["segment"].key == "a" and back["segment"].success
     np.testing.assert_array_equal(back["segment"].version, [1, 2, 3])
-    assert back["rng"].random(3).tolist() == rng.random(3).tolist()
+    assert back["rng"] == rng
     assert torch.equal(back["tensor"], tensor)
 
 
@@ -186,13 +185,15 @@ class Stranger(NamedTuple):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (Stranger(1), r"tree\.a\.0: a Stranger cannot be saved"),
+        (Stranger(1), "a Stranger cannot be saved"),
+        ({0: "zero"}, "a dict with the key 0 cannot be saved"),
+        ({"$": 1}, "a dict with the key '\\$' cannot be saved"),
         ({1, 2}, "a set cannot be saved"),
         (np.array(["text"]), "an array of <U4 cannot be saved"),
         (np.array([object()]), "an array of object cannot be saved"),
     ],
 )
-def test_what_is_not_known_is_refused_and_named(value: Any, message: str, tmp_path: Path):
+def test_what_is_not_known_is_refused(value: Any, message: str, tmp_path: Path):
     with pytest.raises(TypeError, match=message):
         snapshot.save(tmp_path / "tree", {"a": [value]})
     assert not list(tmp_path.iterdir()), "nothing half written"
@@ -204,7 +205,7 @@ def test_what_is_not_known_is_refused_and_named(value: Any, message: str, tmp_pa
         ("tree.json", "{"),
         ("tree.json", '{"$": "Popen", "fields": {"args": "true"}}'),
         ("tree.json", '{"$": "Origin", "fields": {"task": "a", "seed": 1, "decision": 2, "more": 3}}'),
-        ("tree.json", '{"$": "generator", "state": {"bit_generator": "MT19937"}}'),
+        ("tree.json", '{"$": "map", "items": []}'),
         ("tree.safetensors", "\xff" * 64),
     ],
 )

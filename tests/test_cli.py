@@ -150,9 +150,7 @@ def test_eval_in_one_process(tmp_path, tiny_checkpoint, capsys):
     assert cli.main(arguments) == 0
     summary = json.loads(capsys.readouterr().out)
     kept = json.loads((out / "evaluation.json").read_text())
-    seeds = kept["tasks"]["match"].pop("seeds")
-    assert seeds[1] == seeds[0] + 3 and len(kept["tasks"]["match"].pop("failed_seeds")) < 5
-    assert summary == kept, "the seeds are in the file alone"
+    assert summary == kept and kept["tasks"]["match"]["n"] == 4
     assert summary["n"] == 4 and 0 <= summary["ci95"][0] <= summary["success"] <= summary["ci95"][1] <= 1
     assert len(list(out.glob("match_*.mp4"))) == 4
     assert cli.main(arguments) == 2

@@ -4,8 +4,8 @@
     NAME.json           the tree: dicts, lists, tuples, numbers, texts, known kinds of things
     NAME.safetensors    its arrays and tensors, by number
 
-Reading executes nothing. A tree may hold, beside plain values, NumPy arrays, torch tensors, NumPy's default
-generator, and dataclasses and named tuples that were registered with `kind`.
+Reading executes nothing. A tree may hold, beside plain values, NumPy arrays, torch tensors, and dataclasses
+and named tuples that were registered with `kind`.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def save(path: Path, tree: Any) -> None:
     """Writes ``path.json`` and ``path.safetensors``.
 
     Raises:
-        TypeError: the tree holds something of a kind that is not known; names its place.
+        TypeError: the tree holds something of a kind that is not known, or a dict whose keys are no texts.
     """
     arrays: dict[str, np.ndarray] = {}
-    text = json.dumps(to_json(tree, path.name, arrays))
+    text = json.dumps(to_json(tree, arrays))
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(arrays, path.with_suffix(".safetensors"))
     path.with_suffix(".json").write_text(text + "\n")
@@ -58,43 +58,35 @@ def load(path: Path) -> Any:
         raise InputError("checkpoint", str(file), hint) from error
 
 
-def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
+def to_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """A tree as JSON can hold it; its arrays go into `arrays`, by number. Raises as `save` does."""
     cls: Any = type(value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if cls is np.ndarray:
-        return _stored(value, "array", place, arrays)
+        return _stored(value, "array", arrays)
     if cls in (list, tuple):
-        items = [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
+        items = [to_json(part, arrays) for part in value]
         return items if cls is list else {MARK: "tuple", "items": items}
     if cls is dict:
-        parts = {}
-        for key, part in value.items():
-            parts[key] = to_json(part, f"{place}.{key}", arrays)
-        if MARK not in parts and all(isinstance(key, str) for key in parts):
-            return parts
-        keys = [to_json(key, f"{place}.key", arrays) for key in parts]
-        return {MARK: "map", "items": list(zip(keys, parts.values(), strict=True))}
+        for key in value:
+            if not isinstance(key, str) or key == MARK:
+                raise TypeError(f"a dict with the key {key!r} cannot be saved")
+        return {key: to_json(part, arrays) for key, part in value.items()}
     if cls in _KINDS.values():
-        fields = {}
-        for name in cls.__annotations__:
-            fields[name] = to_json(getattr(value, name), f"{place}.{name}", arrays)
+        fields = {name: to_json(getattr(value, name), arrays) for name in cls.__annotations__}
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
         return value.item()
     if cls.__module__ == "torch":
-        array = value.detach().cpu().numpy()
-        return _stored(array, "tensor", place, arrays)
-    if cls is np.random.Generator:
-        return {MARK: "generator", "state": value.bit_generator.state}
-    raise TypeError(f"{place}: a {cls.__name__} cannot be saved")
+        return _stored(value.detach().cpu().numpy(), "tensor", arrays)
+    raise TypeError(f"a {cls.__name__} cannot be saved")
 
 
-def _stored(array: np.ndarray, mark: str, place: str, arrays: dict[str, np.ndarray]) -> dict[str, str]:
+def _stored(array: np.ndarray, mark: str, arrays: dict[str, np.ndarray]) -> dict[str, str]:
     """Put an array into `arrays`; returns the JSON object that stands for it."""
     if array.dtype.kind not in "biuf":
-        raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
+        raise TypeError(f"an array of {array.dtype} cannot be saved")
     name = str(len(arrays))
     arrays[name] = np.asarray(array, order="C")
     return {MARK: mark, "name": name}
@@ -117,15 +109,6 @@ def from_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
             return torch.from_numpy(arrays[value["name"]])
         case "tuple":
             return tuple(from_json(part, arrays) for part in value["items"])
-        case "map":
-            tree = {}
-            for key, part in value["items"]:
-                tree[from_json(key, arrays)] = from_json(part, arrays)
-            return tree
-        case "generator":
-            generator = np.random.default_rng()
-            generator.bit_generator.state = value["state"]
-            return generator
         case name:
             fields = from_json(value["fields"], arrays)
             return _KINDS[name](**fields)

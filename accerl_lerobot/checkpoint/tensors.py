@@ -55,27 +55,28 @@ def place(tensor: Tensor) -> tuple[object, ...]:
     return storage, local.storage_offset(), tensor.shape, tensor.stride()
 
 
-def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
+def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, torch.Tensor]]:
     """A copy on the CPU of an optimiser's state, by the number of the parameter; without learning rates.
 
     All of it is float32, which NumPy knows: of a parameter in bfloat16 it is in bfloat16.
     """
     known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
-    copies: dict[int, dict[str, Tensor]] = {}
+    copies: dict[str, dict[str, Tensor]] = {}
     for number, values in known.items():
-        copies[number] = {}
-        for name, value in values.items():
-            copies[number][name] = copy_of(torch.as_tensor(value)).float()
+        copies[str(number)] = {
+            name: copy_of(torch.as_tensor(value)).float() for name, value in values.items()
+        }
     return copies
 
 
-def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[str, torch.Tensor]]) -> None:
+def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, dict[str, torch.Tensor]]) -> None:
     """Restore what `optimizer_state` has returned for the same parameters."""
     parameters: list[Tensor] = []
     for group in optimizer.param_groups:
         parameters += group["params"]
     parts: dict[int, dict[str, Tensor]] = {}
-    for number, values in state.items():
+    for text, values in state.items():
+        number = int(text)
         parts[number] = dict(values)
         for name, value in values.items():
             if value.dim():  # the number of steps has no dimension and is the same for every process

@@ -182,9 +182,6 @@ def evaluate(arguments: list[str]) -> int:
             task = result.plan.task.replace("/", "-")
             video = out / f"{task}_{result.plan.seed}_{outcome}.mp4"
             write_video(video, [[result.frames]], fps=20)
-    for rates in summary["tasks"].values():  # seeds are in the file alone
-        rates.pop("seeds", None)
-        rates.pop("failed_seeds", None)
     return tell(summary)
 
 

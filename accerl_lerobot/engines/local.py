@@ -133,7 +133,7 @@ class LocalEngine(Engine):
         snapshot.save(state / "replay", self._replay.state())
         engine = {
             "generators": global_generators(),
-            "rng": self._rng,
+            "rng": self._rng.bit_generator.state,
             "outbox": list(self._runner.segments),
             "plans": self._plans.state(),
             "runner": self._runner.state(),
@@ -154,7 +154,7 @@ class LocalEngine(Engine):
         self._update.restore(snapshot.load(directory / "trainer"))
         self._replay.restore(snapshot.load(directory / "replay"))
         engine = snapshot.load(directory / self.state_name)
-        self._rng = engine["rng"]
+        self._rng.bit_generator.state = engine["rng"]
         self._runner.segments.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])

@@ -6,10 +6,10 @@ A rate is never reported without n and an interval.
 
 from __future__ import annotations
 
+import io
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -23,6 +23,13 @@ from accerl_lerobot.errors import for_viewing
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import eval_seed
 
+STYLE = {
+    "text.parse_math": False, "font.size": 9, "axes.grid": True, "grid.color": "#e9ecf1",
+    "axes.spines.top": False, "axes.spines.right": False,
+}  # fmt: skip
+
+
+STEPS = "env steps of online experience"
 FILM = 128, 4
 """Side in pixels and env steps per frame of videos, which show 20 frames a second; see `EpisodePlan.film`."""
 
@@ -36,7 +43,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """Successes out of n; as text ``93.0 % [86.3, 96.6] n=100``."""
+    """Successes out of n; as text ``93 % [86, 97] n=100``."""
 
     successes: int
     n: int
@@ -62,10 +69,7 @@ class Rate:
         return Interval(float(interval.low), float(interval.high))
 
     def __str__(self) -> str:
-        if self.n == 0:
-            return "no episodes"
-        low, high = self.interval()
-        return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
+        return f"{rate(self.value, self.interval())} n={self.n}"
 
 
 def rate_of(results: Sequence[EpisodeResult]) -> Rate:
@@ -84,20 +88,14 @@ def by_task(results: Sequence[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, in all and per task, as plain JSON types.
 
-    Each task has the first and the last of its ``seeds``, and the ``failed_seeds`` among them. ``notes`` say
-    why the success of some episodes may not be what happened.
+    ``notes`` say why the success of some episodes may not be what happened.
     """
-    tasks = {}
-    for name, episodes in by_task(results).items():
-        seeds = sorted(episode.plan.seed for episode in episodes)
-        failed = sorted(episode.plan.seed for episode in episodes if not episode.success)
-        tasks[name] = _rate(episodes) | {"seeds": [seeds[0], seeds[-1]], "failed_seeds": failed}
     return _rate(results) | {
         "return_mean": float(np.mean([result.episode_return for result in results])),
         "steps_mean": float(np.mean([result.steps for result in results])),
         "version_min": min(result.versions[0] for result in results),
         "version_max": max(result.versions[1] for result in results),
-        "tasks": tasks,
+        "tasks": {name: _rate(episodes) for name, episodes in by_task(results).items()},
         "notes": notes(results),
     }
 
@@ -161,43 +159,69 @@ GAP = 4
 BORDER = 5
 
 
-@contextmanager
-def drawing(path: Path) -> Iterator[Any]:
-    """Axes to draw on, with a grid, which are a PNG when the context is left."""
-    from matplotlib.figure import Figure
+class Series(NamedTuple):
+    """Points of one line, and their intervals if there are any."""
 
-    figure = Figure(figsize=(7, 4), dpi=120, layout="tight")
-    axes = figure.subplots()
-    axes.grid(alpha=0.3)
-    yield axes
-    figure.savefig(path)
+    x: np.ndarray
+    y: np.ndarray
+    interval: np.ndarray | None = None  # (2, n)
+
+
+class Chart(NamedTuple):
+    """Series over a common x, by their names."""
+
+    title: str
+    x_label: str
+    series: dict[str, Series]
+    share: bool = False
+    limit: float | None = None
+
+    @property
+    def drawable(self) -> bool:
+        return any(np.isfinite(series.y).any() for series in self.series.values())
+
+    def png(self) -> bytes:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import PercentFormatter
+
+        buffer = io.BytesIO()
+        with mpl.rc_context(STYLE):
+            figure = Figure(figsize=(5.2, 2.6), dpi=150, layout="constrained")
+            axes = figure.subplots()
+            for name, (x, y, interval) in self.series.items():
+                axes.plot(x, y, label=name, marker="o" if len(x) < 20 else "")
+                if interval is not None:
+                    axes.fill_between(x, *interval, alpha=0.2)
+            if self.limit is not None:
+                axes.axhline(self.limit, color="grey", linestyle="--")
+            if self.share:
+                axes.set_ylim(-0.03, 1.04)
+                axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+            axes.set_xlabel(self.x_label)
+            axes.legend()
+            figure.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def evaluations_over_steps(evaluations: Sequence[dict[str, Any]]) -> Series:
+    """Success with its intervals; evaluations are `summarise` results with an ``env_steps`` entry."""
+    ordered = sorted(evaluations, key=lambda evaluation: evaluation["env_steps"])
+    numbers = [(e["env_steps"], e["success"], *e["ci95"]) for e in ordered]
+    steps, success, low, high = np.array(numbers, np.float64).reshape(-1, 4).T
+    return Series(steps, success, np.stack([low, high]))
 
 
 @for_viewing("success_curve.png")
 def success_curve(
     path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]
 ) -> None:
-    """Draws evaluation success with intervals over env steps, and the exploring policy's success behind it.
-
-    Evaluations are `summarise` results with an ``env_steps`` entry, `training` is pairs of env steps and the
-    share of successful exploring episodes.
+    """Draws evaluations, and the share of successful exploring episodes, of which `training` has pairs with
+    env steps.
     """
-    with drawing(path) as axes:
-        if training:
-            steps, share = zip(*training, strict=True)
-            axes.plot(steps, share, color="0.7", lw=1.5, label="while exploring")
-        evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
-        x = [e["env_steps"] for e in evaluations]
-        y = np.array([e["success"] for e in evaluations])
-        ends = np.array([e["ci95"] for e in evaluations]).T
-        lengths = np.abs(ends - y)  # below and above the rate
-        label = "evaluation, 95 % Wilson"
-        axes.errorbar(x, y, yerr=lengths, marker="o", capsize=3, color="C0", label=label)
-        for e in (evaluations[0], evaluations[-1]):
-            place = (e["env_steps"], e["success"])
-            axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
-        axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
-        axes.legend(loc="lower right")
+    exploring = Series(*np.array(training).reshape(-1, 2).T)
+    series = {"while exploring": exploring, "evaluation": evaluations_over_steps(evaluations)}
+    path.write_bytes(Chart("success", STEPS, series, share=True).png())
 
 
 @for_viewing("film")

@@ -54,11 +54,9 @@ class ValueHead(nn.Module):
         super().__init__()
         self.query = nn.Parameter(torch.zeros(width))
         self.norm = nn.LayerNorm(width)
-        self.hidden = nn.Linear(width, HIDDEN)
-        bound = width**-0.5
-        generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
-        for parameter in self.hidden.parameters():  # as nn.Linear begins
-            nn.init.uniform_(parameter, -bound, bound, generator=generator)
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(torch.initial_seed())
+            self.hidden = nn.Linear(width, HIDDEN)
         self.out = nn.Linear(HIDDEN, 1)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)

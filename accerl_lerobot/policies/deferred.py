@@ -14,7 +14,6 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
-import inspect
 import os
 import sys
 import threading
@@ -71,22 +70,7 @@ def import_policies(wanted: str | None) -> None:
             run(sys.modules[name])
 
 
-def _distributions() -> dict[str, list[str]]:
-    """Like ``importlib.metadata.packages_distributions``, but lists of installed files are read as text."""
-    found: dict[str, list[str]] = {}
-    for distribution in importlib.metadata.distributions():
-        names = set((distribution.read_text("top_level.txt") or "").split())
-        if not names:
-            for line in (distribution.read_text("RECORD") or "").splitlines():
-                folder, slash, _ = line.split(",")[0].partition("/")
-                names.add(folder if slash else inspect.getmodulename(folder) or ".")
-        for name in names:
-            if "." not in name:
-                found.setdefault(name, []).append(distribution.metadata["Name"])
-    return found
-
-
 if os.environ.get(OURS):  # now, as much of LeRobot imports the policies or diffusers
-    # transformers and diffusers each ask for them. Python's own function takes a second longer, each time.
-    importlib.metadata.packages_distributions = functools.cache(_distributions)
+    # transformers and diffusers each ask for them, which takes a second or two.
+    importlib.metadata.packages_distributions = functools.cache(importlib.metadata.packages_distributions)
     sys.meta_path.insert(0, _Finder)

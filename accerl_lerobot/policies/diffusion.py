@@ -232,10 +232,6 @@ class DiffusionFamily(NoiseFamily):
             log_prob = log_prob + self._rows(k, path[k + 1], mean, std)
         return log_prob[:, self._factors]
 
-    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
-        log_prob = self.log_prob(encoded.context, latent)
-        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
-
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         stock, noise, eps = self.model.stock_and_noise(batch)
         explore = torch.zeros(len(noise), dtype=torch.bool, device=noise.device)

@@ -133,18 +133,28 @@ class Family(nn.Module, ABC):
 
 
 class NoiseFamily(Family):
-    """A family that acts on standard normal noise, which is drawn from each request's own seed."""
+    """A family that acts on standard normal noise, which is drawn from each request's own seed.
+
+    One without a `score` of its own has a `log_prob` (B, L) of the context and a latent.
+    """
 
     noise_sizes: tuple[tuple[int, ...], ...]
     """Sizes of the noise tensors of one request, in the order of the draws."""
     sample: Callable[..., Action]
     """Called with the context, a tensor of noise (B, *size) for each of these sizes, and bool (B,), True
     where a request explores."""
+    log_prob: Callable[..., Tensor]
+    entropy = 0.0
+    """Differential entropy of what is drawn, which no weight changes."""
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         device = encoded.features.device
         noise = self.noise(requests, *self.noise_sizes, device=device)
         return self.sample(encoded.context, *noise, self.exploring(requests, device))
+
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
+        log_prob = self.log_prob(encoded.context, latent)
+        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     @staticmethod
     def noise(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:

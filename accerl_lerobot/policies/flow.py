@@ -109,10 +109,6 @@ class FlowFamily(NoiseFamily):
         x0, x = latent["path"].unbind(1)
         return self._rows(x, self.shape.integrate(velocity, x0))
 
-    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
-        log_prob = self.log_prob(encoded.context, latent)
-        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
-
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Flow matching at a time from LeRobot's Beta(1.5, 1).
 

@@ -11,7 +11,6 @@ ends        with `close`, which ends all waits, or with an exception in storing 
 from __future__ import annotations
 
 import asyncio
-import copy
 import os
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -59,7 +58,7 @@ class ReplayWorker:
         if state is not None:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
-            self._rng = saved["rng"]
+            self._rng.bit_generator.state = saved["rng"]
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
@@ -141,7 +140,7 @@ class ReplayWorker:
             raise self._failure
         self._clock.enter(CHECKPOINT)
         fault_point("replay.save")
-        state = {"replay": self._replay.state(version), "rng": copy.deepcopy(self._rng)}
+        state = {"replay": self._replay.state(version), "rng": self._rng.bit_generator.state}
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import datetime
-import io
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
 from accerl_lerobot.engines.config import RunConfig, lag_limits
 from accerl_lerobot.errors import ERROR_LOG, InputError
+from accerl_lerobot.evaluation import STEPS, Chart, Series, evaluations_over_steps
 from accerl_lerobot.report.read import Record, Run, changed_fields, column, differences, finite, newest
 from accerl_lerobot.timeline import read_timeline
 
@@ -30,7 +30,6 @@ FEW = 25  # exploring episodes below which their success says nothing; the first
 LATE = 20  # updates at the end of a run that tell whether its samples are too old
 STALE = 0.3
 MOST_GAP = 0.3  # success of imagined episodes less that of real ones above which a report warns
-STEPS = "env steps of online experience"
 MEASURED = (
     "Evaluation is with LeRobot's own sampler on seeds that no run trains on, with 95 % Wilson intervals. "
     "While exploring, the policy has its noise, and success is that of the newest 100 episodes."
@@ -50,56 +49,6 @@ LEARNING = (
     ("clip_fraction", "low_weight"), ("explained_variance",), ("grad_norm", "value_grad_norm"), ("lr",),
 )  # fmt: skip
 """Metrics of each chart of learning."""
-STYLE = {
-    "text.parse_math": False, "font.size": 9, "axes.grid": True, "grid.color": "#e9ecf1",
-    "axes.spines.top": False, "axes.spines.right": False,
-}  # fmt: skip
-
-
-class Series(NamedTuple):
-    """Points of one line, and their intervals if there are any."""
-
-    x: np.ndarray
-    y: np.ndarray
-    interval: np.ndarray | None = None  # (2, n)
-
-
-class Chart(NamedTuple):
-    """Series over a common x, by their names."""
-
-    title: str
-    x_label: str
-    series: dict[str, Series]
-    share: bool = False
-    limit: float | None = None
-
-    @property
-    def drawable(self) -> bool:
-        return any(np.isfinite(series.y).any() for series in self.series.values())
-
-    def png(self) -> str:
-        """The picture as base64."""
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import PercentFormatter
-
-        buffer = io.BytesIO()
-        with mpl.rc_context(STYLE):
-            figure = Figure(figsize=(5.2, 2.6), dpi=150, layout="constrained")
-            axes = figure.subplots()
-            for name, (x, y, interval) in self.series.items():
-                axes.plot(x, y, label=name, marker="o" if len(x) < 20 else "")
-                if interval is not None:
-                    axes.fill_between(x, *interval, alpha=0.2)
-            if self.limit is not None:
-                axes.axhline(self.limit, color="grey", linestyle="--")
-            if self.share:
-                axes.set_ylim(-0.03, 1.04)
-                axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-            axes.set_xlabel(self.x_label)
-            axes.legend()
-            figure.savefig(buffer, format="png")
-        return base64.b64encode(buffer.getvalue()).decode()
 
 
 def over_updates(records: Sequence[Record], names: Sequence[str], **options: Any) -> Chart:
@@ -131,7 +80,7 @@ def html(page: dict[str, Any], folder: Path) -> str:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters["percent"] = percent
-    environment.filters["base64"] = lambda path: base64.b64encode(path.read_bytes()).decode()
+    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
     environment.filters["address"] = lambda path: quote(os.path.relpath(path.resolve(), folder))
     return environment.get_template("page.html").render(**page, version=__version__, video_mb=VIDEO_MB)
 
@@ -142,7 +91,7 @@ def one_run(run: Run) -> dict[str, Any]:
     with contextlib.suppress(InputError):  # another version, or a package of the user's, may have written it
         if not run.offline:
             bound = lag_limits(decode(RunConfig, run.config))[0]
-    success = {"while exploring": exploring(run), "evaluation": evaluated(run)}
+    success = {"while exploring": exploring(run), "evaluation": evaluations_over_steps(run.evaluations)}
     imagined = []
     if len(finite(run.rollout, "success_imagined")):
         imagined = [over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)]
@@ -189,7 +138,7 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
     for name, run in each.items():
         rows.append((name, *_facts(run).values(), status(run)))
         notes += [f"{name}: {text}" for text in warnings(run)]
-    evaluations = {name: evaluated(run) for name, run in each.items()}
+    evaluations = {name: evaluations_over_steps(run.evaluations) for name, run in each.items()}
     explored = {name: exploring(run) for name, run in each.items()}
     unlike = differences([run.config for run in runs])
     blocks = [
@@ -286,13 +235,6 @@ def exploring(run: Run) -> Series:
     last = run.result.get("env_steps", np.inf)  # workers go on during the final evaluation
     counts = (episodes >= FEW) & (steps <= last)
     return Series(steps[counts], column(run.rollout, "success_exploring")[counts])
-
-
-def evaluated(run: Run) -> Series:
-    """Success of the evaluations, with intervals."""
-    intervals = np.array([e["ci95"] for e in run.evaluations], dtype=np.float64).reshape(-1, 2).T
-    steps = column(run.evaluations, "env_steps")
-    return Series(steps, column(run.evaluations, "success"), intervals)
 
 
 def _time_shares(run: Run) -> dict[str, dict[str, float]]:

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.checkpoint import layout, snapshot
-from accerl_lerobot.console import Console
+from accerl_lerobot.console import Console, rate
 from accerl_lerobot.engines import Engine, Progress
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.stopping import Stopping
@@ -165,10 +165,9 @@ class Recorder:
         summary = summarise(results) | {"env_steps": steps, "group": group}
         self.state.evaluations.append(summary)
         self.log.write("evaluation", version, summary)
-        low, high = summary["ci95"]
-        success = f"success {summary['success']:.1%} [{low:.1%}, {high:.1%}] n={summary['n']}"
+        success = rate(summary["success"], summary["ci95"])
         weights = f"weights {summary['version_min']}–{summary['version_max']}"
-        self.console.say(f"{group}: {success} {weights}")
+        self.console.say(f"{group}: success {success} of {summary['n']}, {weights}")
         return summary
 
     def since(self, progress: Progress, key: str) -> float:

@@ -22,9 +22,9 @@ from accerl_lerobot.console import Console, count, duration, number, rate
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig, encode
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation import EvaluationConfig, Rate
+from accerl_lerobot.evaluation import Chart, EvaluationConfig, Rate, Series, evaluations_over_steps
 from accerl_lerobot.report import ReportConfig, write_report
-from accerl_lerobot.report.page import Chart, Series, evaluated, exploring
+from accerl_lerobot.report.page import exploring
 from accerl_lerobot.report.read import read_run
 from accerl_lerobot.run import train as run
 from tests.runs import tiny_run
@@ -112,7 +112,7 @@ def page_of(*runs: Path, **fields: Any) -> Seen:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawing them takes a second a page."""
-    monkeypatch.setattr(Chart, "png", lambda chart: "")
+    monkeypatch.setattr(Chart, "png", lambda chart: b"")
 
 
 def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> No
         assert part in seen.text
     charts = {image["alt"] for image in seen.named("img")}
     assert {"Success rate", "lag_mean, lag_max", "policy_loss", "value_loss"} <= charts
-    assert len(evaluated(read_run(directory)).x) == 3
+    assert len(evaluations_over_steps(read_run(directory).evaluations).x) == 3
     (video,) = seen.named("video")
     assert video["src"].startswith("data:video/mp4;base64,") and "controls" in video
 
@@ -138,7 +138,7 @@ def test_a_chart_is_drawn_whatever_its_numbers_and_names() -> None:
     point = Series(np.array([1.0]), np.array([0.5]), np.array([[0.4], [0.6]]))
     assert not Chart("none", "x", {"a": line}).drawable
     chart = Chart("some", "x", {HOSTILE: line, "$\\frac{": point}, share=True, limit=3.0)
-    assert chart.drawable and chart.png().startswith("iVBOR"), "a PNG"
+    assert chart.drawable and chart.png().startswith(b"\x89PNG")
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -147,7 +147,7 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     seen, run = page_of(folder), read_run(folder)
     assert "Success on door-open-v3: 40 % [31, 50] → 90 % [83, 94]" in seen.text
     assert not [a for _, a in seen.elements if a.get("class") == "warnings"], "nothing went wrong"
-    points = evaluated(run)
+    points = evaluations_over_steps(run.evaluations)
     assert (points.x.tolist(), points.y.tolist()) == ([0, 4000], [0.4, 0.9])
     # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
     assert exploring(run).x.tolist() == [100.0 * i for i in range(25, 41)]
