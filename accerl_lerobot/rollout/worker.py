@@ -94,7 +94,7 @@ class RolloutWorker:
         self._environments = [
             make_environment(env, history, config.reward_model) for _ in range(config.environments)
         ]
-        self._starts: FirstObservations = deque(maxlen=MOST_STARTS)
+        self._first: FirstObservations = deque(maxlen=MOST_STARTS)
         self._world: Any = None  # an `imagined.World`
         self._new_world: deque[tuple[int, Any]] = deque(maxlen=1)
         if imagination is not None and imagination.environments:
@@ -109,12 +109,12 @@ class RolloutWorker:
         """
         if plans is not None:
             self._plans = plans
-            self._starts.clear()
+            self._first.clear()
             if self._world is not None:
                 for task, seed in begun:
                     observation = self._environments[0].reset(seed, task)
-                    self._starts.append((task, observation))
-            self._runner = RolloutRunner(self._environments, plans, self._config, self._starts, self._clock)
+                    self._first.append((task, observation))
+            self._runner = RolloutRunner(self._environments, plans, self._config, self._first, self._clock)
         return os.getpid()
 
     def imagine_with(self, newest: tuple[int, Any]) -> None:
@@ -217,7 +217,7 @@ class RolloutWorker:
 
         torch.set_num_threads(1)
         spec = self._environments[0].spec
-        self._world, imagined = imagined_environments(config, config.environments, spec, self._starts)
+        self._world, imagined = imagined_environments(config, config.environments, spec, self._first)
         self._environments += imagined
 
     def _step(self, slot: int, decision: Decision | None) -> bool:

@@ -73,12 +73,15 @@ class LearnerSettings(NamedTuple):
 
     def begin(self, adapter: Any) -> BaseUpdate:
         """The updates, from the state on, once all ranks have come together."""
+        import torch
+
         from accerl_lerobot.algorithms.update import make_update
 
         update = make_update(adapter, self.algorithm, self.trainer)
         if self.state is not None:
             adapter.load_trainable(snapshot.load(self.state / WEIGHTS))
             update.restore(snapshot.load(self.state / "trainer"))
+            torch.manual_seed(self.seed + update.version)  # not the numbers again that the run began with
         return update
 
 

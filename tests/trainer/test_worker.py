@@ -25,7 +25,13 @@ from tests.algorithms.linear import LinearAdapter, make_segments
 class Stage:
     """A trainer, a replay that notes what it is asked for, and all weights that were published."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, updates: int = 6, batches: int = 10**6) -> None:
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        updates: int = 6,
+        batches: int = 10**6,
+        state: Path | None = None,
+    ) -> None:
         self.asked: list[tuple[int, int]] = []
         self.published: list[dict[str, np.ndarray]] = []
         self.batches = batches
@@ -34,7 +40,8 @@ class Stage:
         monkeypatch.setattr(module, "ray", local)
         monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
         trainer = TrainerConfig(updates=updates, batch_decisions=7, warmup_updates=0, value_warmup_updates=0)
-        self.worker = TrainerWorker(LearnerSettings(PolicyConfig(path="nowhere"), GIPOConfig(), trainer, 0))
+        policy = PolicyConfig(path="nowhere")
+        self.worker = TrainerWorker(LearnerSettings(policy, GIPOConfig(), trainer, 0, state))
 
     def run(self) -> int:
         remote = SimpleNamespace
@@ -67,6 +74,17 @@ def test_it_makes_its_updates_publishes_each_and_draws_no_batch_more(monkeypatch
 def test_a_closed_replay_ends_it_early(monkeypatch: pytest.MonkeyPatch):
     stage = Stage(monkeypatch, batches=2)
     assert stage.run() == 2 and len(stage.worker.metrics()) == 2
+
+
+def test_a_resumed_trainer_goes_on_with_other_random_numbers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    first = Stage(monkeypatch)
+    numbers = torch.rand(3)
+    first.run()
+    first.worker.copy_state()
+    first.worker.write(tmp_path)
+    again = Stage(monkeypatch, updates=8, state=tmp_path / "training_state")
+    assert not torch.equal(torch.rand(3), numbers)
+    assert again.run() == 8 and len(again.asked) == 2
 
 
 def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
