@@ -67,7 +67,7 @@ class InferenceReplica(RestartedWorker):
         return () if self.trainer is None else (self.trainer,)
 
     def begin(self) -> None:
-        self.started(self.actor.serve.remote())
+        self.note_long_call(self.actor.serve.remote())
         if self.trainer is not None:
             self.actor.follow.remote(self.trainer)  # also where `train` asked while it was restarting
         if self.together:
@@ -129,7 +129,7 @@ class RayEngine(Engine):
         self._training = True
         self._last_change = time.monotonic()
         self.set_schedule(self._config.launch.schedule)
-        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor)
+        self._trainer.long_call = self._trainer.actor.run.remote(self._replay.actor)
         for replica in self._inference:
             replica.trainer = self._trainer.actor
             replica.actor.follow.remote(replica.trainer)  # `begin` asks again after a restart
@@ -292,9 +292,9 @@ class RayEngine(Engine):
         ready = [worker.actor.ready.remote(*worker.ready_arguments()) for worker in workers]
         for worker, reference in zip(workers, ready, strict=True):
             worker.pid = worker.result(reference, "ready", START_S)
-        self._replay.work = self._replay.actor.run.remote()
+        self._replay.long_call = self._replay.actor.run.remote()
         if self._world_learner is not None:
-            self._world_learner.work = self._world_learner.actor.run.remote()
+            self._world_learner.long_call = self._world_learner.actor.run.remote()
         for slot in self._rollouts:
             replica = self._inference[slot.index % len(self._inference)]
             slot.services = (replica.endpoint, self._replay.endpoint)
@@ -313,17 +313,17 @@ class RayEngine(Engine):
 
     def _wait_for_ends(self) -> None:
         """Wait a little, and handle every worker whose long call has ended."""
-        works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
-        if not ray.wait(list(works), num_returns=1, timeout=POLL_S)[0]:
+        calls = {worker.long_call: worker for worker in self._everyone() if worker.long_call is not None}
+        if not ray.wait(list(calls), num_returns=1, timeout=POLL_S)[0]:
             return
-        ended = ray.wait(list(works), num_returns=len(works), timeout=0)[0]
-        for reference, worker in works.items():
+        ended = ray.wait(list(calls), num_returns=len(calls), timeout=0)[0]
+        for reference, worker in calls.items():
             if reference in ended:
-                worker.work = None
+                worker.long_call = None
                 try:
                     result = ray.get(reference)
                 except RayError as error:
-                    worker.lost(error)
+                    worker.handle_loss(error)
                 else:
                     self._ended(worker, result)
 
@@ -371,7 +371,7 @@ class RayEngine(Engine):
         except RayError as error:
             # Where a process has died, its long call has ended as well, which `_wait_for_ends` deals with.
             if not (has_died(error) and isinstance(worker, RestartedWorker)):
-                worker.lost(error)
+                worker.handle_loss(error)
             return None
         if worker is self._trainer:
             self._updates += answer or []
@@ -398,8 +398,8 @@ class RayEngine(Engine):
                 self._last_change = time.monotonic()  # a restart has a timeout of its own
                 if worker.advance_start():
                     worker.begin()
-            elif why := worker.hung():
-                worker.lost(WorkerError(f"{worker.name} worker {why}"))
+            elif why := worker.why_given_up():
+                worker.handle_loss(WorkerError(f"{worker.name} worker {why}"))
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""

@@ -3,7 +3,7 @@
 
 Ray restarts the process of a rollout worker or an inference replica when it has died. The driver ends a
 process that hangs or whose long call has failed, which Ray then restarts in the same way, and tells each new
-process its episodes. Resuming a run works the same way.
+process its episodes. Resuming a run calls the same way.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Worker:
         self._launch = launch
         self.endpoint = Endpoint(name=name, actor=actor)
         self.pid = 0  # of its process, once that is ready
-        self.work: Any = None  # reference of the long call
+        self.long_call: Any = None  # reference of the long call
         self.last_answer: Any = None
         self._question: list[Any] = []  # references of the answer, and of what its process has warned of
         self._asked = 0.0
@@ -92,7 +92,7 @@ class Worker:
         ready, _ = ray.wait(self._question, num_returns=len(self._question), timeout=timeout)
         return len(ready) == len(self._question)
 
-    def hung(self) -> str:
+    def why_given_up(self) -> str:
         """The reason to give the worker up; empty if there is none."""
         if not self._question or self._is_answered():
             return ""
@@ -113,7 +113,7 @@ class Worker:
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
-    def lost(self, error: Exception) -> None:
+    def handle_loss(self, error: Exception) -> None:
         """Deal with a failure: here the run cannot go on."""
         if isinstance(error, InputError | WorkerError):  # another process would meet bad input again
             raise error
@@ -140,12 +140,12 @@ class RestartedWorker(Worker):
         """Start the long call of a process that is ready."""
         raise NotImplementedError
 
-    def started(self, reference: Any) -> None:
+    def note_long_call(self, reference: Any) -> None:
         """Note the long call of a process."""
-        self.work = reference
+        self.long_call = reference
         self._since = time.monotonic()
 
-    def lost(self, error: Exception) -> None:
+    def handle_loss(self, error: Exception) -> None:
         """Have another process take the place of the lost one, unless that was so too often."""
         if isinstance(error, InputError):
             raise error
@@ -162,7 +162,7 @@ class RestartedWorker(Worker):
         logger.warning("%s worker is restarted %s: %s", self.name, number, reason)
         if not has_died(error):
             ray.kill(self.actor, no_restart=False)
-        self.work = self.last_answer = None
+        self.long_call = self.last_answer = None
         self._question = []
         self._since = math.inf
         self._asked = time.monotonic()
@@ -242,7 +242,7 @@ class RolloutSlot(RestartedWorker):
     def begin(self) -> None:
         if self.world is not None:
             self.actor.imagine_with.remote(self.world)
-        self.started(self.actor.run.remote(*self.services))
+        self.note_long_call(self.actor.run.remote(*self.services))
 
     def take(self, report: Report) -> list[EpisodeResult]:
         """Note a report; the episodes in it."""
@@ -271,21 +271,21 @@ class RolloutSlot(RestartedWorker):
         if self.ask("report", training, self._unsent, in_turn):
             self._unsent = []
 
-    def hung(self) -> str:
+    def why_given_up(self) -> str:
         """The reason to give the worker up, which may be an environment that does not return."""
-        why = super().hung()
+        why = super().why_given_up()
         report: Report | None = self.last_answer
         if why or report is None or report.busy_s <= self._launch.stall_s:
             return why
         cause = "its environment has not returned" if report.in_environment else "it has done nothing"
         return f"{cause} for {report.busy_s:.0f} s"
 
-    def lost(self, error: Exception) -> None:
+    def handle_loss(self, error: Exception) -> None:
         self.past = self.counters
         self.past["restarts"] += 1
         self.incarnation = self.next_incarnation
         self._unsent = list(self.outstanding.values())
-        super().lost(error)
+        super().handle_loss(error)
 
 
 def has_died(error: Exception) -> bool:

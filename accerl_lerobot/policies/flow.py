@@ -80,7 +80,10 @@ def flow_shape(config: Any, num_steps: int, causal: bool = False) -> FlowShape:
 
 
 class FlowFamily(NoiseFamily):
-    """Flow policies explored by noise on the denoised chunk. The latent is ``path``, (2, K, D)."""
+    """Flow policies explored by noise on the denoised chunk.
+
+    The latent is ``path``, (2, K, D): the noise that was denoised, and the noisy result.
+    """
 
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__(model, sampler)
