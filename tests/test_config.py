@@ -13,10 +13,11 @@ import yaml
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
 from accerl_lerobot.cli.configs import DemosRun, EvalRun, WorldModelRun
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
+from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.run.preflight import check_sft_policy, check_start
 
@@ -161,10 +162,36 @@ def test_odd_text_stays_text() -> None:
         assert parse(RunConfig, [f"--job_name={text}"]).job_name == text
 
 
+def test_numbers_of_a_free_mapping_are_numbers() -> None:
+    arguments = [
+        "--env.type=gym",
+        "--env.id=a/B",
+        "--env.kwargs={sigma: 1e-3, b: [2.5E4, a1e2], c: {d: -1e0}}",
+    ]
+    env: Any = parse(RunConfig, arguments).env
+    assert env.kwargs == {"sigma": 1e-3, "b": [25000.0, "a1e2"], "c": {"d": -1.0}}
+
+
+def test_a_mapping_on_the_command_line_takes_the_place_of_the_file_s(tmp_path: Path) -> None:
+    path = written(tmp_path, "policy: {rename_map: {a: b}}\nenv: {type: gym, id: a/B, images: {x: render}}\n")
+    assert parse(RunConfig, [path, "--policy.rename_map={}"]).policy.rename_map == {}
+    env: Any = parse(RunConfig, [path, "--env.images={y: pixels}"]).env
+    assert env.images == {"y": "pixels"}
+    env = parse(RunConfig, [path, "--env.images.y=pixels"]).env
+    assert env.images == {"x": "render", "y": "pixels"}
+
+
+def test_another_environment_has_its_own_defaults(recipe: str) -> None:
+    config = parse(RunConfig, [recipe, "--env.type=gym", "--env.id=a/B"])
+    assert config.env == GymConfig(id="a/B"), "neither the task nor the size of the recipe's"
+
+
 def test_another_repository_is_not_asked_for_the_former_one_s_commit(tmp_path: Path) -> None:
     path = written(tmp_path, "policy: {path: me/one, revision: abc}\n")
     assert parse(RunConfig, [path, "--policy.path=me/other"]).policy.revision is None
     assert parse(RunConfig, [path, "--policy.path=me/one"]).policy.revision == "abc"
+    path = written(tmp_path, "dataset: {repo_id: me/one, root: one, revision: abc}\n")
+    assert parse(RunConfig, [path, "--dataset.repo_id=me/other"]).dataset == DatasetConfig(repo_id="me/other")
 
 
 ARENA = f"them/arena@{'0123456789' * 4}"

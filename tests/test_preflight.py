@@ -18,11 +18,18 @@ from accerl_lerobot import cli
 from accerl_lerobot.algorithms import AWRConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.envs import SimulatedConfig, make_environment
+from accerl_lerobot.envs import LiberoConfig, SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import check_actions, check_features, env_features, fine_tuned_features
-from accerl_lerobot.run.preflight import check_device, check_imitates, check_sft_policy, check_training_data
+from accerl_lerobot.run.preflight import (
+    check_device,
+    check_evaluation,
+    check_imitates,
+    check_sft_policy,
+    check_training_data,
+)
 from tests.policies.checkpoints import write_act
 from tests.tiny_datasets import FRONT, IMAGE, STATE, write_dataset
 
@@ -105,6 +112,21 @@ def test_a_dataset_of_another_environment(verb: str, tmp_path: Path, capsys):
     line = refused(capsys, verb, "--sft.steps=1", ACT, f"--output_dir={out}", *SIMULATED, *TINY)
     assert "no observation.images.corner2 in the environment, which offers " + FRONT in line
     assert not out.exists()
+
+
+def test_tasks_that_would_be_left_out(tmp_path: Path, capsys, caplog):
+    both, out = ["--env.type=simulated", "--env.task=match,mirror"], tmp_path / "out"
+    line = refused(capsys, "demos", *both, "--demos.episodes=1", f"--root={out}")
+    assert line == "accerl: demos.episodes=1: env has 2 tasks; use 2 or more" and not out.exists()
+    spec = replace(SPEC, tasks=("a", "b", "c"))
+    evaluation = EvaluationConfig(episodes=200, every_updates=5, episodes_during=2)
+    check_evaluation(evaluation, LiberoConfig(), spec)
+    assert "evaluation.episodes_during=2: the last 1 of 3 tasks are left out" in caplog.text
+    assert "evaluation.episodes=200: each task has 50 starts" in caplog.text
+    caplog.clear()
+    check_evaluation(replace(evaluation, episodes=150, episodes_during=3), LiberoConfig(), spec)
+    check_evaluation(replace(evaluation, episodes_during=3), SimulatedConfig(), spec)
+    assert not caplog.records
 
 
 QUICK = ["train", str(ROOT / "recipes" / "quickstart.yaml")]

@@ -73,11 +73,11 @@ def demos(arguments: list[str]) -> int:
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.config.machine import check_disk
     from accerl_lerobot.demos.record import record_demos
-    from accerl_lerobot.run.preflight import check_environment
+    from accerl_lerobot.run.preflight import check_demonstrations, check_environment
 
     with redirect_stdout(sys.stderr):
         check_disk(config.root, "root")
-        check_environment(config.env)
+        check_demonstrations(config.demos, check_environment(config.env))
         path = record_demos(config.env, config.demos, config.root, config.seed)
     sys.stdout.write(f"{path}\n")
     return 0

@@ -298,6 +298,10 @@ def read_recipe(path: Path) -> dict[str, Any]:
     return tree or {}
 
 
+class Whole(dict[str, Any]):
+    """A mapping that the command line gives as one value, in place of all that a file has there."""
+
+
 class _Loader(yaml.SafeLoader):
     """YAML with unique keys."""
 
@@ -318,6 +322,8 @@ def _value(text: str) -> Any:
         value = yaml.load(text, _Loader) if text else text
     except Exception:  # see `read_recipe`
         return text
+    if isinstance(value, dict):
+        return Whole(value)
     unquoted = isinstance(value, str) and not text.startswith(("'", '"'))
     odd = isinstance(value, int) and not isinstance(value, bool) and str(value) != text
     if unquoted or odd:  # YAML would cut off what follows a #, and reads 012345 as an octal number
@@ -382,15 +388,16 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         former = under.get(TYPE, getattr(defaults.get(name), TYPE, None))
         chosen = over.get(TYPE, former)
         if name not in sections:  # fields of LeRobot's or of a simulator's, such as `sft.policy`
-            merged[name] = under | over if chosen == former else over
+            whole = isinstance(over, Whole) or chosen != former
+            merged[name] = over if whole else under | over
             continue
         for place in ("path", "repo_id"):
-            if over.get(place, under.get(place)) != under.get(place):  # the revision is of another repository
-                under = {key: value for key, value in under.items() if key != "revision"}
+            if over.get(place, under.get(place)) != under.get(place):  # these are of another repository
+                under = {key: value for key, value in under.items() if key not in ("revision", "root")}
         section = sections[name]
         kind = choices_of(section).get(str(chosen), section)
-        if chosen != former:
-            under = _fitting(kind, under)
+        if chosen != former:  # another environment has other tasks, limits and images
+            under = {} if name == "env" else _fitting(kind, under)
         merged[name] = _overridden(kind, under, over)
     return merged
 
@@ -487,6 +494,8 @@ def _converted(kind: Any, value: Any) -> Any:
         for key, entry in value.items():
             converted[str(key)] = _converted(arguments[1], entry)
         return converted
+    if kind is Any:
+        return _numbers(value)
     if isinstance(value, bool):
         return value
     if kind is str and isinstance(value, (int, float, datetime.date)):
@@ -496,6 +505,17 @@ def _converted(kind: Any, value: Any) -> Any:
             return kind(value)  # YAML takes 1e-5 for text
         except (OverflowError, ValueError):
             return value
+    return value
+
+
+def _numbers(value: Any) -> Any:
+    """The same, with numbers such as 1e-5, which YAML takes for text."""
+    if isinstance(value, dict):
+        return {key: _numbers(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_numbers(entry) for entry in value]
+    if isinstance(value, str) and re.fullmatch(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+", value):
+        return float(value)
     return value
 
 

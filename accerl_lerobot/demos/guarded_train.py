@@ -92,7 +92,9 @@ def _adapted(stock: Any) -> Any:
         # LeRobot 0.6.1 renames the dataset's features and not their statistics.
         meta.stats = rename_stats(meta.stats, cfg.rename_map)
         pixels = [math.prod(meta.features[camera]["shape"]) for camera in meta.camera_keys]
-        fits = 4 * sum(pixels) * cfg.policy.n_obs_steps * len(train) <= MAX_BYTES
+        frames = len(cfg.policy.observation_delta_indices or [0]) * len(train)
+        processes = max(1, cfg.num_workers)  # each has a cache of its own
+        fits = 4 * sum(pixels) * frames * processes <= MAX_BYTES
         if fits and not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming:
             train = CachedDataset(train)
         return train, evaluation

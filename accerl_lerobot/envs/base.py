@@ -198,6 +198,7 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     """``module:class`` of the environment, made from the config."""
     named_by: ClassVar[str] = "type"
     """The field that names the environment."""
+    starts: ClassVar[int | None] = None  # of a task in evaluations, which repeat them; None: one a seed
     expert: ClassVar[str | None] = None
     """``module:function`` of the scripted expert for demonstrations: given an environment and a task, it
     returns a function whose every call is the action (A,) for the state that the environment is in."""
@@ -375,32 +376,20 @@ class SuiteEnvironment(EpisodeEnvironment):
 
 
 def lerobot_eval_arguments(env: Mapping[str, Any], renames: Mapping[str, str]) -> list[str]:
-    """``--env.…``, names and seed of stock ``lerobot-eval``; none if LeRobot cannot have the environment.
+    """``--env.…``, names and seed of stock ``lerobot-eval``; none if the environment is of no known type.
 
     `renames` is the run's ``policy.rename_map``.
     """
     kind = env.get("type")
-    fields = dict[str, Any]()
-    if kind == "lerobot" and env.get("success", IS_SUCCESS) == IS_SUCCESS:  # the only key that LeRobot reads
-        fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
-        if env.get("max_steps"):
-            fields["episode_length"] = env["max_steps"]
-        if env.get("discover_packages_path"):
-            fields["discover_packages_path"] = env["discover_packages_path"]
-        camera = env.get("camera")
-        if camera:  # the name that we give to LeRobot's lone image
-            image = f"observation.images.{camera}"
-            renames = {**renames, "observation.image": renames.get(image, image)}
-    elif kind != "lerobot" and kind in EnvConfig.get_known_choices():
-        # Only what differs from the defaults, as the run wrote them.
-        usual = encoded_defaults(EnvConfig.get_choice_class(kind))
-        given = {name: value for name, value in env.items() if value != usual.get(name)}
-        plugin = "accerl_lerobot.envs.lerobot_plugin"
-        fields = {"discover_packages_path": plugin, "type": "accerl", "environment": json.dumps(given)}
-        if "discover_packages_path" in given:
-            fields["environment.discover_packages_path"] = given["discover_packages_path"]
-    if not fields:
+    if kind not in EnvConfig.get_known_choices():
         return []
+    # Only what differs from the defaults, as the run wrote them.
+    usual = encoded_defaults(EnvConfig.get_choice_class(kind))
+    given = {name: value for name, value in env.items() if value != usual.get(name)}
+    plugin = "accerl_lerobot.envs.lerobot_plugin"
+    fields = {"discover_packages_path": plugin, "type": "accerl", "environment": json.dumps(given)}
+    if "discover_packages_path" in given:
+        fields["environment.discover_packages_path"] = given["discover_packages_path"]
     arguments = [f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()]
     if renames:
         arguments.append(f"--rename_map={shlex.quote(json.dumps(renames))}")

@@ -138,6 +138,7 @@ class LiberoConfig(SuiteConfig):
     from the task's own regions, so that no evaluated start is trained on.
     """
 
+    starts = 50
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
     environment = "accerl_lerobot.envs.libero_simulator:LiberoEnvironment"
     groups = staticmethod(suites)

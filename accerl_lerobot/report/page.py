@@ -279,6 +279,9 @@ def _facts(run: Run) -> dict[str, str]:
     seen = exploring(run).x
     if steps is None and len(seen):
         steps = seen[-1]
+    episodes = newest(run.rollout, "episodes")
+    if episodes is not None and run.before:
+        episodes -= run.before["n"]
     mean_lag = None
     lags = finite(run.train, "lag_mean")
     if len(lags):
@@ -289,7 +292,7 @@ def _facts(run: Run) -> dict[str, str]:
         "algorithm": str(run.section("algorithm").get("type")),
         "seed": str(run.config.get("seed")),
         "updates": number(result.get("updates", newest(run.train, "update"))),
-        "episodes": number(result.get("episodes", newest(run.rollout, "episodes"))),
+        "episodes": number(result.get("episodes", episodes)),
         "env steps": number(steps),
         "mean lag": number(mean_lag, 2),
         "wall time": duration(result.get("wall_s", newest(run.train, "wall_s"))),

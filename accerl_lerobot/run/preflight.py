@@ -47,8 +47,10 @@ from accerl_lerobot.world_model.config import SimulatorStateConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.algorithms import AlgorithmConfig
+    from accerl_lerobot.demos.record import DemosConfig
     from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engines.config import DatasetConfig, RunConfig
+    from accerl_lerobot.evaluation import EvaluationConfig
     from accerl_lerobot.metrics import WandBConfig
     from accerl_lerobot.policies.config import PolicyConfig
 
@@ -162,7 +164,10 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> Enviro
         field = "sft.policy.type" if new else "policy.type"
         check_likelihood(algorithm.type, sampler_config(config.policy, policy.type), policy.type, field)
     spec = check_environment(config.env, config.rollout.reward_model)
+    check_evaluation(config.evaluation, config.env, spec)
     if config.policy.path is None:
+        if config.dataset.repo_id is None:
+            check_demonstrations(config.demos, spec)
         check_training_data(config.sft, config.dataset, policy, spec, config.policy.rename_map)
     else:
         _check_reads(policy, config.policy, spec)
@@ -171,6 +176,31 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> Enviro
         if config.dataset.repo_id is not None:
             _check_remembered(config, spec, int(policy.n_obs_steps))
     return spec
+
+
+def check_demonstrations(config: DemosConfig, spec: EnvironmentSpec) -> None:
+    """Refuse a dataset in which tasks have no episode."""
+    tasks = len(spec.tasks)
+    if config.episodes < tasks:
+        raise InputError("demos.episodes", config.episodes, f"env has {tasks} tasks; use {tasks} or more")
+
+
+def check_evaluation(config: EvaluationConfig, env: EnvConfig, spec: EnvironmentSpec) -> None:
+    """Warn of an evaluation that leaves tasks out, or repeats episodes."""
+    tasks = len(spec.tasks)
+    counts = {"episodes": config.episodes}
+    if config.every_updates:
+        counts["episodes_during"] = config.episodes_during
+    for name, count in counts.items():
+        if count < tasks:
+            logger.warning(
+                "evaluation.%s=%d: the last %d of %d tasks are left out", name, count, tasks - count, tasks
+            )
+        if env.starts and count > env.starts * tasks:
+            logger.warning(
+                "evaluation.%s=%d: each task has %d starts, so that episodes are repeated, and the intervals "
+                "are too narrow", name, count, env.starts,
+            )  # fmt: skip
 
 
 def check_off_policy(config: RunConfig, policy: Any, spec: EnvironmentSpec) -> None:

@@ -50,7 +50,13 @@ from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.run import resuming
 from accerl_lerobot.run.adapter import demonstrations_of, make_adapter
 from accerl_lerobot.run.loop import Loop, Recorder, Times, run_plans
-from accerl_lerobot.run.preflight import check_device, check_environment, check_policy, check_start
+from accerl_lerobot.run.preflight import (
+    check_device,
+    check_environment,
+    check_evaluation,
+    check_policy,
+    check_start,
+)
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
 from accerl_lerobot.world_model.config import ImaginationConfig
@@ -103,6 +109,7 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
     with ray_session.opened(config.launch):
         check_device(config)
         spec = check_environment(config.env, config.rollout.reward_model)
+        check_evaluation(config.evaluation, config.env, spec)
         # Nothing is learnt, whatever the recipe says.
         config = replace(config, algorithm=GIPOConfig(), world_model=None, imagination=ImaginationConfig())
         config = pinned(config)

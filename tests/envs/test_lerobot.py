@@ -19,16 +19,14 @@ from tests.hub_cache import cached_repo
 
 
 def test_the_command_for_stock_lerobot():
-    env = {"type": "lerobot", "name": "pusht", "kwargs": {"obs_type": "pixels"}, "max_steps": 9}
-    command = lerobot_eval_arguments(env | {"discover_packages_path": "my_envs"}, {})
-    flags = {"type=pusht", "obs_type=pixels", "episode_length=9", "discover_packages_path=my_envs"}
-    assert {f"--env.{flag}" for flag in flags} < set(command) and "rename_map" not in str(command)
-    assert lerobot_eval_arguments(env | {"success": "succeed"}, {}) == [], "LeRobot reads its own key only"
+    env = {"type": "lerobot", "name": "aloha", "task": "Push the T", "max_steps": 9}
     renames = {"observation.images.top": "observation.images.camera1"}
-    text = lerobot_eval_arguments(env | {"camera": "top"}, renames)[-2]
-    named = {"observation.image": "observation.images.camera1"}  # LeRobot's name of its lone camera
-    [argument] = shlex.split(text)
-    assert json.loads(argument.removeprefix("--rename_map=")) == renames | named
+    command = lerobot_eval_arguments(env | {"discover_packages_path": "my_envs", "camera": "image"}, renames)
+    values = dict(shlex.split(argument)[0].split("=", 1) for argument in command)
+    assert values["--env.type"] == "accerl" and json.loads(values["--rename_map"]) == renames
+    assert json.loads(values["--env.environment"]) == env | {"discover_packages_path": "my_envs"}
+    assert values["--env.environment.discover_packages_path"] == "my_envs"
+    assert lerobot_eval_arguments({"type": "theirs"}, {}) == []
 
 
 def test_images_and_states_are_lerobot_s():

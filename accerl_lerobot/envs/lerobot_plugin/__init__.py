@@ -27,6 +27,7 @@ from accerl_lerobot.errors import InputError, warn_once
 from accerl_lerobot.experience import TASK, Observation
 
 VIDEO_SIZE = 256
+LONE = "observation.image"  # LeRobot's name of the image of an environment with one camera
 
 
 class AccerlEnv(gym.Env):
@@ -42,9 +43,10 @@ class AccerlEnv(gym.Env):
         self.task = task
         self.metadata = self.metadata | {"render_fps": spec.fps}
         self._max_episode_steps = spec.max_steps  # LeRobot's rollout asks for it under this name
-        images = {_camera(key): Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
+        pixels = _pixels({key: Box(0, 255, size, np.uint8) for key, size in spec.images.items()})
+        if isinstance(pixels, dict):
+            pixels = Dict(pixels)
         state = Box(-np.inf, np.inf, (spec.state_dim,), np.float32)
-        pixels = Dict(images)
         self.observation_space = Dict({"pixels": pixels, "agent_pos": state})
         self.action_space = Box(spec.action_low, spec.action_high, dtype=np.float32)
 
@@ -73,7 +75,7 @@ class AccerlEnv(gym.Env):
         self._environment.close()
 
     def _format(self, observation: Observation) -> dict[str, Any]:
-        pixels = {_camera(key): observation[key] for key in self._environment.spec.images}
+        pixels = _pixels({key: observation[key] for key in self._environment.spec.images})
         return {"pixels": pixels, "agent_pos": observation["observation.state"]}
 
 
@@ -103,7 +105,7 @@ class AccerlEnvConfig(EnvConfig):
         }
         self.features_map = {"action": "action", "agent_pos": "observation.state"}
         for key, size in spec.images.items():
-            name = f"pixels/{_camera(key)}"
+            name = "pixels" if key == LONE else f"pixels/{_camera(key)}"
             self.features[name] = PolicyFeature(type=FeatureType.VISUAL, shape=size)
             self.features_map[name] = key
 
@@ -135,6 +137,13 @@ class AccerlEnvConfig(EnvConfig):
                 vector = gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
             vectors[task] = {0: vector}
         return vectors
+
+
+def _pixels(images: dict[str, Any]) -> Any:
+    """Images as LeRobot's environments have them: by camera, or a lone one that has no name."""
+    if LONE in images:
+        return images[LONE]
+    return {_camera(key): image for key, image in images.items()}
 
 
 def _camera(key: str) -> str:
