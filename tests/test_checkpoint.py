@@ -116,7 +116,7 @@ def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
 def test_only_the_newest_keep_their_training_state(tmp_path: Path):
     for version in range(1, 6):
         saved(tmp_path, version)
-        layout.prune(tmp_path, needed="000002")
+        layout.prune(tmp_path, needed="000002", every=1)
     kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / layout.TRAINING_STATE).exists()]
     assert kept == ["000002", "000004", "000005"]
     for path in tmp_path.glob("0*"):
@@ -127,8 +127,18 @@ def test_only_the_newest_keep_their_training_state(tmp_path: Path):
         layout.newest_whole(tmp_path, "000003")
     with pytest.raises(InputError, match="no such checkpoint; there are 000001, 000002"):
         layout.newest_whole(tmp_path, "000006")
-    layout.prune(tmp_path)
+    layout.prune(tmp_path, every=1)
     assert not (tmp_path / "000002" / layout.TRAINING_STATE).exists()
+
+
+def test_of_those_that_were_saved_by_time_only_the_newest_are_kept(tmp_path: Path):
+    for version in (0, 9, 10, 14, 22, 29, 31, 33, 34):
+        saved(tmp_path, version)
+        layout.prune(tmp_path, every=10)
+    kept = [int(path.name) for path in sorted(tmp_path.glob("0*"))]
+    assert kept == [10, 22, 31, 33, 34], "the first ones from every tenth update on, and the two newest"
+    layout.prune(tmp_path)
+    assert [int(path.name) for path in sorted(tmp_path.glob("0*"))] == [33, 34]
 
 
 def test_pruning_that_was_interrupted_is_completed(tmp_path: Path):

@@ -163,11 +163,8 @@ def test_odd_text_stays_text() -> None:
 
 
 def test_numbers_of_a_free_mapping_are_numbers() -> None:
-    arguments = [
-        "--env.type=gym",
-        "--env.id=a/B",
-        "--env.kwargs={sigma: 1e-3, b: [2.5E4, a1e2], c: {d: -1e0}}",
-    ]
+    kwargs = "{sigma: 1e-3, b: [2.5E4, a1e2], c: {d: -1e0}}"
+    arguments = ["--env.type=gym", "--env.id=a/B", f"--env.kwargs={kwargs}"]
     env: Any = parse(RunConfig, arguments).env
     assert env.kwargs == {"sigma": 1e-3, "b": [25000.0, "a1e2"], "c": {"d": -1.0}}
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run that was stopped, or killed, and gone on with by its command line."""
 
+import contextlib
 import json
 import os
 import shlex
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock, patch
 
+import psutil
 import pytest
 import yaml
 
@@ -251,7 +253,13 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
             process = subprocess.Popen(arguments, stdout=out, stderr=out)
             saved = (run / "checkpoints").glob
             assert eventually(lambda: any(int(p.name) >= least for p in saved("0*")), 240), log.read_text()
-            process.send_signal(number)
+            # As a scheduler does: SIGTERM to all processes of the job.
+            family = [psutil.Process(process.pid)]
+            if number == signal.SIGTERM:
+                family += family[0].children(recursive=True)
+            for member in family:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    member.send_signal(number)
             return process.wait(60)
 
     assert until(6, [*command, str(path), f"--output_dir={run}"], signal.SIGKILL) == -signal.SIGKILL

@@ -215,19 +215,22 @@ def saved_version(state: Path) -> int:
     return int(record["step"])
 
 
-def prune(checkpoints: Path, *, needed: str | None = None) -> None:
-    """Removes the training state of all but the newest `KEEP` checkpoints; their policies stay.
+def prune(checkpoints: Path, *, needed: str | None = None, every: int = 0) -> None:
+    """Removes all but the newest `KEEP` checkpoints; of those due `every` so many updates the policies stay.
 
     The files of the one named `needed` stay too, although it cannot be resumed from any more: an inference
     replica that is lost starts again where all workers did.
     """
-    with_state = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
-    for checkpoint in with_state[:-KEEP]:
-        state = checkpoint / TRAINING_STATE
+    numbered = _numbered(checkpoints)
+    former = 0
+    for checkpoint in numbered[:-KEEP]:
         # Without this file the others do not count, even where their removal is interrupted.
-        (state / f"{RUN_STATE}.json").unlink(missing_ok=True)
+        (checkpoint / TRAINING_STATE / f"{RUN_STATE}.json").unlink(missing_ok=True)
+        version = int(checkpoint.name)
+        by_number = every > 0 and version // every > former // every
+        former = version
         if checkpoint.name != needed:
-            shutil.rmtree(state)
+            shutil.rmtree(checkpoint / TRAINING_STATE if by_number else checkpoint, ignore_errors=True)
 
 
 def _numbered(checkpoints: Path) -> list[Path]:

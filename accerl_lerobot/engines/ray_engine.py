@@ -31,6 +31,7 @@ from accerl_lerobot.engines.ray_session import NO_HUB_TOKEN, learns_states, plac
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.engines.supervision import (
     RESTARTED,
+    SAVE_S,
     START_S,
     RestartedWorker,
     RolloutSlot,
@@ -181,12 +182,12 @@ class RayEngine(Engine):
         state = directory / TRAINING_STATE
         # Records that the trainer has sent come first: `copy_state` returns the rest, up to its version.
         self._hear(self._trainer, self._limit)
-        version, records = self._trainer.call("copy_state")  # it waits for an update at most
+        version, records = self._trainer.call("copy_state", timeout=SAVE_S)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates.
-        self._replay.call("save", state, version)
+        self._replay.call("save", state, version, timeout=SAVE_S)
         if self._world_learner is not None:
-            self._world_learner.call("save", directory)
-        self._trainer.call("write", directory)
+            self._world_learner.call("save", directory, timeout=SAVE_S)
+        self._trainer.call("write", directory, timeout=SAVE_S)
         save_rollouts(state, self._rollouts)
         self._last_change = time.monotonic()
         updates = self._updates + records
@@ -274,7 +275,7 @@ class RayEngine(Engine):
         ]
         world_model = online = None
         if learns_states(config):
-            learning = (config.seed, config.trainer.num_threads, timeline)
+            learning = (config.seed, config.trainer.num_threads, config.policy.device, timeline)
             world_model = add(WORLD_MODEL_WORKER, "world_model", WorldModelWorker, 4, *learning).actor
         if config.imagination.learns:
             from accerl_lerobot.world_model.training import OnlineLearningWorker

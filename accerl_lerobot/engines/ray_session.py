@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.engines.stopping import handled
+from accerl_lerobot.engines.stopping import handled, left_to_this_process
 from accerl_lerobot.errors import InputError, in_one_line
 
 if TYPE_CHECKING:
@@ -125,13 +125,14 @@ def _start_private() -> None:
         raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {hint}")
     for attempt in range(1, STARTS + 1):
         try:
-            ray.init(
-                address="local",
-                include_dashboard=False,
-                _node_ip_address="127.0.0.1",
-                log_to_driver=False,
-                configure_logging=False,
-            )
+            with left_to_this_process():
+                ray.init(
+                    address="local",
+                    include_dashboard=False,
+                    _node_ip_address="127.0.0.1",
+                    log_to_driver=False,
+                    configure_logging=False,
+                )
             return
         except Exception as error:  # Ray raises a plain one when its start-up fails
             ray.shutdown()

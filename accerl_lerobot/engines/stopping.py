@@ -51,6 +51,20 @@ def handled(
 
 
 @contextmanager
+def left_to_this_process() -> Iterator[None]:
+    """Processes that are started in this context, and theirs, do not notice SIGTERM.
+
+    Schedulers send it to all processes of a job. The run then still needs its workers, to save what they
+    have.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
 def interrupted() -> Iterator[None]:
     """Handle SIGTERM like Ctrl-C: what has been started is ended on the way out."""
 

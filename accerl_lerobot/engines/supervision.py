@@ -32,6 +32,7 @@ from accerl_lerobot.transport import Endpoint
 
 logger = logging.getLogger(__name__)
 
+SAVE_S = 1800.0  # timeout for a part of a checkpoint, or ``launch.stall_s`` if that is more
 START_S = 600.0  # timeout for the start of a worker, or ``launch.stall_s`` if that is more
 STEADY_S = 30.0  # a worker that has run for so long starts counting restarts anew
 LAST_WARNINGS_S = 1.0  # how long the last warnings of workers are waited for
@@ -99,9 +100,9 @@ class Worker:
         silent = time.monotonic() - self._asked
         return f"has not answered for {silent:.0f} s" if silent > self._launch.stall_s else ""
 
-    def call(self, method: str, *arguments: Any) -> Any:
+    def call(self, method: str, *arguments: Any, timeout: float = 0.0) -> Any:
         """The result of a method of the actor."""
-        return self.result(getattr(self.actor, method).remote(*arguments), method)
+        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
 
     def result(self, reference: Any, method: str, timeout: float = 0.0) -> Any:
         """The result of a call that has been made; waits for ``launch.stall_s``, or for longer."""

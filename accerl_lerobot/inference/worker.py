@@ -35,7 +35,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport import Address, PendingRequest, Server, node_address
+from accerl_lerobot.transport import RETRY_S, Address, PendingRequest, Server, node_address
 
 LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
 
@@ -111,11 +111,16 @@ class InferenceWorker:
         self._following = asyncio.create_task(self._follow(trainer))
 
     async def _follow(self, trainer: Any) -> None:
-        from ray.exceptions import RayError  # not above: a config is read before Ray is imported
+        # Not above: a config is read before Ray is imported.
+        from ray.exceptions import ActorUnavailableError, RayError
 
         with contextlib.suppress(RayError):  # a lost trainer is the engine's to deal with
             while True:
-                version, references = await trainer.next_weights.remote(self._name, self._applied_version)
+                try:
+                    version, references = await trainer.next_weights.remote(self._name, self._applied_version)
+                except ActorUnavailableError:  # for a moment, as when a connection breaks
+                    await asyncio.sleep(RETRY_S)
+                    continue
                 if references:
                     self._applied.clear()
                     self._waiting_weights.append((version, await references[0]))

@@ -141,7 +141,7 @@ class RolloutWorker:
             in_environment=in_environment,
             moves=self._moves,
             spent=self._spent,
-            seeds_used=self._plans.seeds_used,
+            seeds_used=max(self._plans.seeds_used, self._plans.imagined_seeds_used),
         )
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:

@@ -90,6 +90,7 @@ class RunState:
     evaluations: list[dict[str, Any]] = field(default_factory=list)
     during: dict[str, list[EpisodeResult]] = field(default_factory=dict)
     """Evaluations while training, and their episodes so far."""
+    planned: dict[str, int] = field(default_factory=dict)  # number of the episodes of each
     curve: list[tuple[float, float]] = field(default_factory=list)  # env steps, success of exploring episodes
     recent: list[bool] = field(default_factory=list)  # success of the newest exploring episodes
     imagined: list[bool] = field(default_factory=list)  # the same, of imagined episodes
@@ -147,7 +148,7 @@ class Recorder:
             results = state.during.get(group)
             if results is not None:
                 results.append(episode)
-                if len(results) == self.config.evaluation.episodes_during:
+                if len(results) == state.planned[group]:
                     self.report(group, results, self.env_steps(progress), progress.version)
 
     def record_updates(self, updates: list[dict[str, float]]) -> None:
@@ -251,7 +252,8 @@ class Loop:
         summary: dict[str, Any] = plain(self._summary(after, progress))
         layout.write_json(self.directory / layout.SUMMARY, summary)
         self._draw(filmed, results)
-        layout.prune(self._checkpoints)  # no replica restarts from `_began_at` any more
+        every = self.config.save_every_updates
+        layout.prune(self._checkpoints, every=every)  # no replica restarts from `_began_at` any more
         return summary
 
     def _begin(self) -> list[EpisodeResult]:
@@ -336,8 +338,10 @@ class Loop:
         """Queue the evaluation of this number, which rollout workers play beside exploring."""
         self.state.evaluations_due = number
         group = f"during-{number}"
+        episodes = self.config.evaluation.episodes_during
         self.state.during[group] = []
-        self._plan(self.config.evaluation.episodes_during, group)
+        self.state.planned[group] = episodes
+        self._plan(episodes, group)
 
     def _save_is_due(self, progress: Progress) -> bool:
         seconds = self.config.save_every_s
@@ -348,7 +352,8 @@ class Loop:
     def _save(self) -> None:
         with self.times.clock.during(CHECKPOINT):
             path = layout.save_checkpoint(self._checkpoints, self._write)
-        layout.prune(self._checkpoints, needed=self._began_at)
+        every = self.config.save_every_updates
+        layout.prune(self._checkpoints, needed=self._began_at, every=every)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / layout.PRETRAINED}")
 

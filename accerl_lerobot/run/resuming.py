@@ -27,9 +27,11 @@ CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch.address", "launch.placement", "launch.schedule",
     "launch.stall_s", "launch.max_restarts", "wandb", "save_every_updates", "save_every_s", "trainer.updates",
     "trainer.num_threads", "trainer.ranks", "trainer.sharding", "trainer.activation_checkpointing",
-    "inference", "imagination.discover_packages_path", "env.assets",
+    "inference", "env.assets", "policy.device", "imagination.discover_packages_path", "imagination.path",
+    "imagination.learn.dataset", "world_model.path", "rollout.reward_model.path",
 )  # fmt: skip
-"""Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
+"""Fields and sections that may change when a run is resumed: what is learned, and from what, stays. Another
+machine may have another device, and files elsewhere."""
 WARM_START = "warm_start.json"
 """File with the path of the policy that came of a run's own demonstrations and SFT."""
 

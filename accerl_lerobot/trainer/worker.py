@@ -49,7 +49,7 @@ LOAD_S = 600.0  # how long a rank may take to load its policy
 RANK_WAIT_SHARE = 0.4
 """Share of ``launch.stall_s`` for which a rank waits for the others: below 1, so that the loss of a rank is
 raised here before the driver gives this process up."""
-APPLIED_S = 300.0  # timeout for all replicas together: a forward pass and a copy of the weights
+APPLIED_S = 1800.0  # timeout for all replicas together, in which one that hangs is restarted
 ASK_S = 10.0  # how long a replica's question for newer weights waits before it is answered with nothing
 
 
@@ -144,7 +144,9 @@ class TrainerWorker:
         """Until the last update: take the batch, ask for the next one, step, publish."""
         decisions = self._config.batch_decisions
         updates = self._config.updates
-        upcoming = replay.sample.remote(decisions, self._update.version)
+        upcoming: Any = None
+        if self._update.version < updates:
+            upcoming = replay.sample.remote(decisions, self._update.version)
         idle_since = time.monotonic()
         while self._update.version < updates:
             batch = upcoming
@@ -304,7 +306,12 @@ class Peers:
     def joining(self, method: str, *arguments: Any) -> Iterator[None]:
         """They do `method` while the first rank does its part inside; an error of theirs is raised here."""
         calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
-        yield
+        try:
+            yield
+        except Exception:
+            if calls:  # it may have waited in vain for one that failed, whose error says more
+                ray.get(ray.wait(calls, num_returns=len(calls), timeout=0)[0])
+            raise
         if calls:
             ray.get(calls, timeout=self._timeout_s)
 

@@ -40,13 +40,14 @@ class Learned(NamedTuple):
 class WorldModelWorker:
     """Becomes a threaded Ray actor in `engines.ray_engine`; one call at a time touches the model."""
 
-    def __init__(self, seed: int, num_threads: int, timeline: Path | None = None) -> None:
+    def __init__(self, seed: int, num_threads: int, device: str, timeline: Path | None = None) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, WORLD_MODEL_WORKER)
         import torch
 
         torch.set_num_threads(num_threads)
         torch.manual_seed(seed)
+        self._device = device
         self._learner: StateLearner | None = None
         self._lock = threading.Lock()
         self._clock.enter(WAIT_IN)
@@ -64,7 +65,9 @@ class WorldModelWorker:
         """Go on from a learner's `state`; `model` is on the CPU."""
         import torch
 
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = "cpu"
+        if self._device != "cpu" and torch.cuda.is_available():
+            device = "cuda"
         with self._lock:
             self._learner = StateLearner(model.to(device))
             self._learner.restore(state)
