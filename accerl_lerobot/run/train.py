@@ -141,15 +141,10 @@ def _with_absolute_paths(config: RunConfig) -> RunConfig:
         return replace(section, path=str(local.absolute()))
 
     rollout = replace(config.rollout, reward_model=absolute(config.rollout.reward_model))
-    imagination = absolute(config.imagination)
-    root = imagination.learn.dataset.root
-    if root is not None:
-        dataset = replace(imagination.learn.dataset, root=str(Path(root).expanduser().absolute()))
-        imagination = replace(imagination, learn=replace(imagination.learn, dataset=dataset))
     return replace(
         config,
         policy=absolute(config.policy),
-        imagination=imagination,
+        imagination=absolute(config.imagination),
         world_model=absolute(config.world_model),
         rollout=rollout,
     )
