@@ -108,7 +108,7 @@ def test_evaluations_are_logged_in_order_with_the_weights_they_used(finished):
     assert steps == sorted(steps) and steps[-1] == finished[1]["env_steps"]
 
 
-@pytest.mark.parametrize(("seconds", "versions"), [(1e-9, ["000000", "000001", "000002"]), (1e9, ["000000"])])
+@pytest.mark.parametrize(("seconds", "versions"), [(1e-9, ["000002"]), (1e9, ["000000"])])
 def test_checkpoints_by_time(seconds: float, versions: list[str], tiny_checkpoint, tmp_path):
     saves = {"save_every_updates": 0, "save_every_s": seconds}
     executed(local_run(tiny_checkpoint, tmp_path, trainer={"updates": 3}, **saves))

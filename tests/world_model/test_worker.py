@@ -63,7 +63,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
 def learners(timeout_s: float = 60.0) -> tuple[StateLearner, RemoteStateLearner]:
     """A learner in this process, and one that goes on from the same weights elsewhere."""
     here = StateLearner(model())
-    worker = WorldModelWorker(0, torch.get_num_threads())
+    worker = WorldModelWorker(0, torch.get_num_threads(), "auto")
     return here, RemoteStateLearner(Handle(worker), StateLearner(model()), timeout_s)
 
 
