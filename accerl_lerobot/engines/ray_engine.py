@@ -31,7 +31,7 @@ from accerl_lerobot.engines.ray_session import NO_HUB_TOKEN, learns_states, plac
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.engines.supervision import (
     RESTARTED,
-    SAVE_S,
+    SAVE_LIMITS,
     START_S,
     RestartedWorker,
     RolloutSlot,
@@ -182,12 +182,13 @@ class RayEngine(Engine):
         state = directory / TRAINING_STATE
         # Records that the trainer has sent come first: `copy_state` returns the rest, up to its version.
         self._hear(self._trainer, self._limit)
-        version, records = self._trainer.call("copy_state", timeout=SAVE_S)  # it waits for an update at most
+        limit = SAVE_LIMITS * self._limit
+        version, records = self._trainer.call("copy_state", timeout=limit)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates.
-        self._replay.call("save", state, version, timeout=SAVE_S)
+        self._replay.call("save", state, version, timeout=limit)
         if self._world_learner is not None:
-            self._world_learner.call("save", directory, timeout=SAVE_S)
-        self._trainer.call("write", directory, timeout=SAVE_S)
+            self._world_learner.call("save", directory, timeout=limit)
+        self._trainer.call("write", directory, timeout=limit)
         save_rollouts(state, self._rollouts)
         self._last_change = time.monotonic()
         updates = self._updates + records

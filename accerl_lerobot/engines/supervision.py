@@ -32,7 +32,7 @@ from accerl_lerobot.transport import Endpoint
 
 logger = logging.getLogger(__name__)
 
-SAVE_S = 1800.0  # timeout for a part of a checkpoint, or ``launch.stall_s`` if that is more
+SAVE_LIMITS = 4  # how often ``launch.stall_s`` a worker may take to write its part of a checkpoint
 START_S = 600.0  # timeout for the start of a worker, or ``launch.stall_s`` if that is more
 STEADY_S = 30.0  # a worker that has run for so long starts counting restarts anew
 LAST_WARNINGS_S = 1.0  # how long the last warnings of workers are waited for
@@ -110,7 +110,8 @@ class Worker:
         try:
             return ray.get(reference, timeout=timeout)
         except GetTimeoutError as error:
-            raise WorkerError(f"{self.name} worker did not answer {method} within {timeout:.0f} s") from error
+            why = f"did not answer {method} within {timeout:.0f} s; if it needs longer, raise launch.stall_s"
+            raise WorkerError(f"{self.name} worker {why}") from error
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
