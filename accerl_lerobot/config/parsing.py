@@ -374,8 +374,9 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     """`tree` with `given` laid over it.
 
     Where `given` picks another type than the file's, the new type takes over the fields that it has and whose
-    values fit, except in ``env``: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``. Of a policy type of
-    LeRobot's the fields are not known here, so another ``sft.policy.type`` replaces all of them.
+    values fit: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``. Another ``env.type`` takes
+    over nothing. Of a policy type of LeRobot's the fields are not known here, so another ``sft.policy.type``
+    replaces all of them.
     """
     merged = tree | given
     sections = sections_of(config_class)
