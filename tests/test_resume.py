@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -253,13 +254,12 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
             process = subprocess.Popen(arguments, stdout=out, stderr=out)
             saved = (run / "checkpoints").glob
             assert eventually(lambda: any(int(p.name) >= least for p in saved("0*")), 240), log.read_text()
-            # As a scheduler does: SIGTERM to all processes of the job.
-            family = [psutil.Process(process.pid)]
-            if number == signal.SIGTERM:
-                family += family[0].children(recursive=True)
-            for member in family:
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    member.send_signal(number)
+            if number == signal.SIGTERM:  # as schedulers do, to all processes of the job
+                for member in psutil.Process(process.pid).children(recursive=True):
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        member.send_signal(number)
+                time.sleep(3)
+            process.send_signal(number)
             return process.wait(60)
 
     assert until(6, [*command, str(path), f"--output_dir={run}"], signal.SIGKILL) == -signal.SIGKILL
