@@ -7,6 +7,8 @@ MetaWorld and Gymnasium take seeds below 2**32; each use owns one range of them.
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -64,6 +66,16 @@ def eval_seed(run_seed: int, index: int) -> int:
     """
     place = run_seed * _EVALUATIONS_PER_RUN + index
     return EVAL_SEEDS.start + place % len(EVAL_SEEDS)
+
+
+@contextmanager
+def torch_seeded(seed: int) -> Iterator[None]:
+    """Torch's generators begin with this seed in the context, and go on as before afterwards."""
+    import torch
+
+    with torch.random.fork_rng():
+        torch.manual_seed(seed % 2**63)
+        yield
 
 
 def global_generators() -> dict[str, Any]:

@@ -236,9 +236,7 @@ class OffPolicyUpdate(BaseUpdate):
             torch.stack(list(losses.values())).sum().backward()
             for name, value in losses.items():
                 metrics[name] = metrics.get(name, 0.0) + float(value.detach())
-        if self.version < self.config.value_warmup_updates:
-            for parameter in self._policy:
-                parameter.grad = None
+        self.spare_policy()
         loss = sum(metrics.values())
         norm = torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip)
         self.apply(self.optimizer, "a step of the policy", loss, float(norm))

@@ -180,14 +180,11 @@ class RatioUpdate(BaseUpdate):
 
     def _step(self, loss: float) -> Metrics:
         """A step of the optimiser along the gradient, whose loss it was, if both are finite."""
-        warmup = self.config.value_warmup_updates
-        lr = self.config.lr * self.lr_share(warmup)
+        lr = self.config.lr * self.lr_share(self.config.value_warmup_updates)
         value_lr = self.config.value_lr * self.lr_share()
         for group, rate in zip(self.optimizer.param_groups, (lr, value_lr), strict=True):
             group["lr"] = rate
-        if self.version < warmup:
-            for parameter in self._policy:  # its moments in the optimiser begin with its learning rate
-                parameter.grad = None
+        self.spare_policy()
         # Each by itself, or the larger gradient would scale the other one down.
         norm = self._clip(self._policy)
         value_norm = self._clip(self._value)

@@ -83,6 +83,15 @@ class BaseUpdate(ABC):
         self.config = replace(self.config, updates=state["schedule_updates"])
         restore_optimizer(self.optimizer, state["optimizer"])
 
+    def spare_policy(self) -> None:
+        """Drops the policy's gradient in the first updates, which are the critic's alone.
+
+        Its moments in the optimiser so begin with its learning rate.
+        """
+        if self.version < self.config.value_warmup_updates:
+            for parameter in self._policy:
+                parameter.grad = None
+
     def lr_share(self, start: int = 0) -> float:
         """Share of the peak of a learning rate that begins with update `start`."""
         return self.config.lr_share(self.version, start)

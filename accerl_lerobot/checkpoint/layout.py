@@ -221,16 +221,16 @@ def prune(checkpoints: Path, *, needed: str | None = None, every: int = 0) -> No
     The files of the one named `needed` stay too, although it cannot be resumed from any more: an inference
     replica that is lost starts again where all workers did.
     """
-    numbered = _numbered(checkpoints)
     former = 0
-    for checkpoint in numbered[:-KEEP]:
+    for checkpoint in _numbered(checkpoints)[:-KEEP]:
         # Without this file the others do not count, even where their removal is interrupted.
         (checkpoint / TRAINING_STATE / f"{RUN_STATE}.json").unlink(missing_ok=True)
         version = int(checkpoint.name)
         by_number = every > 0 and version // every > former // every
         former = version
-        if checkpoint.name != needed:
-            shutil.rmtree(checkpoint / TRAINING_STATE if by_number else checkpoint, ignore_errors=True)
+        removed = checkpoint / TRAINING_STATE if by_number else checkpoint
+        if checkpoint.name != needed and removed.exists():
+            shutil.rmtree(removed)
 
 
 def _numbered(checkpoints: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 
 Ray restarts the process of a rollout worker or an inference replica when it has died. The driver ends a
 process that hangs or whose long call has failed, which Ray then restarts in the same way, and tells each new
-process its episodes. Resuming a run calls the same way.
+process its episodes. Resuming a run works the same way.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Worker:
         self._launch = launch
         self.endpoint = Endpoint(name=name, actor=actor)
         self.pid = 0  # of its process, once that is ready
-        self.long_call: Any = None  # reference of the long call
+        self.long_call: Any = None  # reference of it
         self.last_answer: Any = None
         self._question: list[Any] = []  # references of the answer, and of what its process has warned of
         self._asked = 0.0

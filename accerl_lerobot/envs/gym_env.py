@@ -42,7 +42,7 @@ RETURNS = {
 }
 """Values that Gymnasium's methods return."""
 _STATE = "observation.state"
-_IMAGE = "observation.image"
+LONE_IMAGE = "observation.image"
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
 
 
@@ -76,7 +76,7 @@ class GymnasiumEnvironment(EpisodeEnvironment):
         self._task = next(iter(environments))
         self._begin(0, self._task)
         observation = self._observe()
-        images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
+        images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(LONE_IMAGE)}
         texts = [self._instruction(task) for task in environments]
         first = environments[self._task]
         limit = self.config.max_steps
@@ -234,7 +234,7 @@ class GymEnvironment(GymnasiumEnvironment):
             size = config.image_size
             if size:
                 picture = resized(picture, size, size)
-            observation[f"{_IMAGE}s.{camera}"] = picture
+            observation[f"{LONE_IMAGE}s.{camera}"] = picture
         keys = config.environment_state
         if keys:
             numbers = self._vector("environment_state", {"state": state, **raw}, keys)
@@ -341,7 +341,7 @@ class LeRobotEnvironment(GymnasiumEnvironment):
 
         text = self._instruction(self._task)
         batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
-        images = [key for key in batch if key.startswith(_IMAGE)]
+        images = [key for key in batch if key.startswith(LONE_IMAGE)]
         if _STATE not in batch or not images:
             shown = ", ".join(key for key in batch if key.startswith("observation."))
             hint = f"a policy needs images and a state, and this environment shows {shown or 'neither'}"
@@ -351,8 +351,8 @@ class LeRobotEnvironment(GymnasiumEnvironment):
         observation: Observation = {TASK: text, _STATE: batch[_STATE][0].numpy().astype(np.float32)}
         for key in images:
             name = key
-            if key == _IMAGE and self.config.camera:
-                name = f"{_IMAGE}s.{self.config.camera}"
+            if key == LONE_IMAGE and self.config.camera:
+                name = f"{LONE_IMAGE}s.{self.config.camera}"
             # LeRobot has divided by 255; rounding brings every one of the 256 values back.
             image = (batch[key][0].permute(1, 2, 0) * 255).round().byte()
             observation[name] = image.numpy().copy()

@@ -206,8 +206,7 @@ class Chart(NamedTuple):
 
 def evaluations_over_steps(evaluations: Sequence[dict[str, Any]]) -> Series:
     """Success with its intervals; evaluations are `summarise` results with an ``env_steps`` entry."""
-    ordered = sorted(evaluations, key=lambda evaluation: evaluation["env_steps"])
-    numbers = [(e["env_steps"], e["success"], *e["ci95"]) for e in ordered]
+    numbers = sorted((e["env_steps"], e["success"], *e["ci95"]) for e in evaluations)
     steps, success, low, high = np.array(numbers, np.float64).reshape(-1, 4).T
     return Series(steps, success, np.stack([low, high]))
 

@@ -37,6 +37,7 @@ from accerl_lerobot.policies.family import Encoded, Family, Latent, Model, poole
 from accerl_lerobot.policies.features import ACTION, STATE, policy_features
 from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
+from accerl_lerobot.seeds import torch_seeded
 
 HIDDEN = 128
 ROUNDING = 1e-5  # by which numbers of two decisions may differ and be the same
@@ -54,8 +55,7 @@ class ValueHead(nn.Module):
         super().__init__()
         self.query = nn.Parameter(torch.zeros(width))
         self.norm = nn.LayerNorm(width)
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(torch.initial_seed())
+        with torch_seeded(torch.initial_seed()):
             self.hidden = nn.Linear(width, HIDDEN)
         self.out = nn.Linear(HIDDEN, 1)
         nn.init.zeros_(self.out.weight)

@@ -135,7 +135,7 @@ class Family(nn.Module, ABC):
 class NoiseFamily(Family):
     """A family that acts on standard normal noise, which is drawn from each request's own seed.
 
-    One without a `score` of its own has a `log_prob` (B, L) of the context and a latent.
+    One without a `score` of its own has `entropy`, and a `log_prob` (B, L) of the context and a latent.
     """
 
     noise_sizes: tuple[tuple[int, ...], ...]
@@ -144,7 +144,7 @@ class NoiseFamily(Family):
     """Called with the context, a tensor of noise (B, *size) for each of these sizes, and bool (B,), True
     where a request explores."""
     log_prob: Callable[..., Tensor]
-    entropy = 0.0
+    entropy: float
     """Differential entropy of what is drawn, which no weight changes."""
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:

@@ -31,7 +31,7 @@ from accerl_lerobot.policies.config import ChunkNoiseConfig, executed_rows
 from accerl_lerobot.policies.family import Latent
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.processing import CONSTANT, Processing
-from accerl_lerobot.seeds import decision_of, episode_of
+from accerl_lerobot.seeds import decision_of, episode_of, torch_seeded
 
 logger = logging.getLogger(__name__)
 
@@ -168,8 +168,7 @@ class StockAdapter(PretrainedAdapter):
         """(1, A) by LeRobot's `select_action`, in normalised units."""
         arrays, tasks = stack_observations([request])
         # LeRobot's samplers draw from the global generator: here from the request's seed.
-        with torch.random.fork_rng(), self.autocast():
-            torch.manual_seed(request.noise_seed % 2**63)
+        with torch_seeded(request.noise_seed), self.autocast():
             action: Tensor = policy.select_action(self.processing.prepare(arrays, tasks))
         return action.float()
 
@@ -224,8 +223,7 @@ class StockAdapter(PretrainedAdapter):
         arrays, tasks = stack_observations(requests)
         policy = self.policy
         action_dim = policy.config.action_feature.shape[0]
-        with torch.random.fork_rng(), self.autocast():
-            torch.manual_seed(requests[0].noise_seed % 2**63)
+        with torch_seeded(requests[0].noise_seed), self.autocast():
             policy.reset()
             batches = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
             *earlier, newest = batches

@@ -121,13 +121,12 @@ def demonstrations(
         return
     chunk = like.actions.shape[1]
     most = min(ROWS, FRAMES // chunk)
-    episodes, frames = some_of_each_task(meta, instructions, most * chunk)
+    episodes, phases = some_of_each_task(meta, chunk, most, ROWS, instructions)
     if len(episodes) < meta.total_episodes:
         why = f"the others are of other tasks, or more than {most} decisions"
         logger.warning("%d of %d demonstrations join the memory: %s", len(episodes), meta.total_episodes, why)
     if not episodes:
         return
-    phases = min(chunk, max(1, ROWS * chunk // frames))
     for segment in recorded(
         dataset, meta, wanted, chunk, episodes, like.time_limit, phases, reward, decision_cost
     ):
@@ -136,22 +135,25 @@ def demonstrations(
         yield segment
 
 
-def some_of_each_task(meta: Any, instructions: tuple[str, ...], most: int) -> tuple[list[int], int]:
-    """Indices of some `most` frames' whole episodes, the same share of each task's, and the frames there are.
+def some_of_each_task(
+    meta: Any, chunk: int, most: int, enough: int, instructions: tuple[str, ...] = ()
+) -> tuple[list[int], int]:
+    """Indices of the episodes to be read, and `phases` for `recorded`.
 
-    Without `instructions` all tasks count.
+    The episodes are whole ones of some `most` decisions in all, the same share of each task's. A short
+    dataset is read in several phases, up to `enough` decisions. Without `instructions` all tasks count.
     """
     by_task: dict[str, list[int]] = {}
     for episode, texts in enumerate(meta.episodes["tasks"]):
         if not instructions or texts[0] in instructions:
             by_task.setdefault(texts[0], []).append(episode)
     lengths = meta.episodes["length"]
-    frames = sum(sum(lengths[episode] for episode in episodes) for episodes in by_task.values())
-    share = min(1.0, most / max(1, frames))
+    frames = max(1, sum(sum(lengths[episode] for episode in episodes) for episodes in by_task.values()))
+    share = min(1.0, most * chunk / frames)
     chosen: list[int] = []
     for episodes in by_task.values():
         chosen += episodes[: math.ceil(share * len(episodes))]
-    return sorted(chosen), frames
+    return sorted(chosen), min(chunk, max(1, enough * chunk // frames))
 
 
 def recorded(
@@ -186,11 +188,10 @@ def recorded(
             success_at = episode.success_at
             success = episode.success or success_at is None
             end = len(episode.rows)
-            labelled = success_at is not None
             if success_at is not None and success_at >= 0 and reward in ("", SUCCESS_ALONE):
                 end = success_at + 1
             rewards = episode.rewards
-            if rewards is None or (labelled and reward == SUCCESS_ALONE):
+            if rewards is None or (success_at is not None and reward == SUCCESS_ALONE):
                 rewards = np.zeros(end, np.float32)
                 rewards[-1] = success
             columns = observations(data, episode.rows[:end], vectors, images)

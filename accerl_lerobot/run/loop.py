@@ -252,8 +252,7 @@ class Loop:
         summary: dict[str, Any] = plain(self._summary(after, progress))
         layout.write_json(self.directory / layout.SUMMARY, summary)
         self._draw(filmed, results)
-        every = self.config.save_every_updates
-        layout.prune(self._checkpoints, every=every)  # no replica restarts from `_began_at` any more
+        self._prune()  # no replica restarts from `_began_at` any more
         return summary
 
     def _begin(self) -> list[EpisodeResult]:
@@ -318,6 +317,7 @@ class Loop:
 
     def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
         """Queue the episodes of an evaluation."""
+        self.state.planned[group] = episodes
         plans = evaluation_plans(self.tasks, episodes, group, seed=self.config.seed, filmed=filmed)
         self.engine.plan(plans)
 
@@ -338,10 +338,8 @@ class Loop:
         """Queue the evaluation of this number, which rollout workers play beside exploring."""
         self.state.evaluations_due = number
         group = f"during-{number}"
-        episodes = self.config.evaluation.episodes_during
         self.state.during[group] = []
-        self.state.planned[group] = episodes
-        self._plan(episodes, group)
+        self._plan(self.config.evaluation.episodes_during, group)
 
     def _save_is_due(self, progress: Progress) -> bool:
         seconds = self.config.save_every_s
@@ -352,10 +350,12 @@ class Loop:
     def _save(self) -> None:
         with self.times.clock.during(CHECKPOINT):
             path = layout.save_checkpoint(self._checkpoints, self._write)
-        every = self.config.save_every_updates
-        layout.prune(self._checkpoints, needed=self._began_at, every=every)
+        self._prune(self._began_at)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / layout.PRETRAINED}")
+
+    def _prune(self, needed: str | None = None) -> None:
+        layout.prune(self._checkpoints, needed=needed, every=self.config.save_every_updates)
 
     def _write(self, folder: Path) -> int:
         """Fill the folder of a checkpoint; returns its number of updates."""

@@ -26,6 +26,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.run.adapter import make_adapter
+from accerl_lerobot.seeds import torch_seeded
 from accerl_lerobot.world_model.config import SimulatorStateConfig, default_state_model
 
 if TYPE_CHECKING:
@@ -153,12 +154,11 @@ def _remember(
         size += math.prod(shape) * (1 if is_picture else 4)
     most = max(1, min(algorithm.memory, BYTES // size))
     longest = int(max(meta.episodes["length"]))
-    phases = min(chunk, max(1, most * chunk // meta.total_frames))
     outcomes: dict[int, bool] = {}  # episode → success
     totals: dict[int, float] = {}  # episode → reward of its first segment
     with console.stage("reading the dataset", total=meta.total_frames) as stage:
         frames = 0
-        episodes, _ = some_of_each_task(meta, (), most * chunk)
+        episodes, phases = some_of_each_task(meta, chunk, most, most)
         for segment in recorded(config.dataset, meta, shapes, chunk, episodes, longest, phases):
             update.remember(segment)
             episode = segment.origin.seed
@@ -194,8 +194,7 @@ def _imitation(update: Any) -> dict[str, float | None]:
         rows = np.random.default_rng(0).permutation(rows)[:COMPARED]
         losses[name] = None
         if len(rows):
-            with torch.random.fork_rng(), update.adapter.autocast():
-                torch.manual_seed(0)
+            with torch_seeded(0), update.adapter.autocast():
                 observations = update.memory.observations(rows)
                 chunks = update.tensor("chunk", rows)
                 loss, _ = update.adapter.imitate(*observations, chunks)

@@ -39,7 +39,7 @@ from accerl_lerobot.policies.config import executed_rows
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.untrusted import refusing
 from accerl_lerobot.rollout.runner import FirstObservations, start_of
-from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.seeds import noise_seed, torch_seeded
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
     Episode,
@@ -187,8 +187,7 @@ class ImaginedEnvironment(Environment):
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         actions = checked_actions(actions, self.spec)
         # Equal episodes in any process, although a model may draw from the global generator.
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(noise_seed(self._seed, self._steps))
+        with torch_seeded(noise_seed(self._seed, self._steps)):
             prediction = self._world.step(self._state, actions)
         self._state = prediction.state
         frames = prediction.frames[0].numpy()

@@ -143,9 +143,9 @@ def _loaded(config: TDMPCStateConfig) -> tuple[Any, Processing]:
     kind = policy.config.type
     if kind != "tdmpc":
         raise InputError("world_model.path", config.path, f"its type is {kind}; give one of type tdmpc")
-    mode = policy.config.normalization_mapping.get("VISUAL")
-    if mode is not None and mode.name != "IDENTITY":
-        hint = f"its images are normalised by {mode.name}; train it with IDENTITY, LeRobot's default"
+    mode = policy.config.normalization_mapping.get("VISUAL", "IDENTITY")
+    if mode != "IDENTITY":
+        hint = f"its images are normalised by {mode.value}; train it with IDENTITY, LeRobot's default"
         raise InputError("world_model.path", config.path, hint)
     return policy, processing
 

@@ -23,11 +23,11 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from accerl_lerobot.config.parsing import DISCOVER, decode
 from accerl_lerobot.envs import EnvConfig as EnvironmentConfig
 from accerl_lerobot.envs import make_environment
+from accerl_lerobot.envs.gym_env import LONE_IMAGE
 from accerl_lerobot.errors import InputError, warn_once
 from accerl_lerobot.experience import TASK, Observation
 
 VIDEO_SIZE = 256
-LONE = "observation.image"  # LeRobot's name of the image of an environment with one camera
 
 
 class AccerlEnv(gym.Env):
@@ -105,7 +105,7 @@ class AccerlEnvConfig(EnvConfig):
         }
         self.features_map = {"action": "action", "agent_pos": "observation.state"}
         for key, size in spec.images.items():
-            name = "pixels" if key == LONE else f"pixels/{_camera(key)}"
+            name = "pixels" if key == LONE_IMAGE else f"pixels/{_camera(key)}"
             self.features[name] = PolicyFeature(type=FeatureType.VISUAL, shape=size)
             self.features_map[name] = key
 
@@ -141,8 +141,8 @@ class AccerlEnvConfig(EnvConfig):
 
 def _pixels(images: dict[str, Any]) -> Any:
     """Images as LeRobot's environments have them: by camera, or a lone one that has no name."""
-    if LONE in images:
-        return images[LONE]
+    if LONE_IMAGE in images:
+        return images[LONE_IMAGE]
     return {_camera(key): image for key, image in images.items()}
 
 
