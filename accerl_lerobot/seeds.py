@@ -69,11 +69,14 @@ def eval_seed(run_seed: int, index: int) -> int:
 
 
 @contextmanager
-def torch_seeded(seed: int) -> Iterator[None]:
-    """Torch's generators begin with this seed in the context, and go on as before afterwards."""
+def torch_seeded(seed: int, devices: Any = None) -> Iterator[None]:
+    """Torch's generators begin with this seed in the context, and go on as before afterwards.
+
+    `devices` are the GPUs whose generators do so too; None: all, and ``()``: none, so that none is looked at.
+    """
     import torch
 
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices):
         torch.manual_seed(seed % 2**63)
         yield
 

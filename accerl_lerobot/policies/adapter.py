@@ -55,7 +55,7 @@ class ValueHead(nn.Module):
         super().__init__()
         self.query = nn.Parameter(torch.zeros(width))
         self.norm = nn.LayerNorm(width)
-        with torch_seeded(torch.initial_seed()):
+        with torch_seeded(torch.initial_seed(), ()):
             self.hidden = nn.Linear(width, HIDDEN)
         self.out = nn.Linear(HIDDEN, 1)
         nn.init.zeros_(self.out.weight)

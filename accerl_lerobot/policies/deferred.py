@@ -75,8 +75,8 @@ def _distributions() -> dict[str, list[str]]:
     """``importlib.metadata.packages_distributions``, but lists of installed files are read as text."""
     found: dict[str, list[str]] = {}
     for distribution in importlib.metadata.distributions():
-        files = distribution.read_text("RECORD") or ""
-        for name in set(re.findall(r"^(\w+)(?:/|\.py,|\.cpython)", files, re.MULTILINE)):
+        files = f"\n{distribution.read_text('RECORD')}"
+        for name in set(re.findall(r"\n(\w+)(?:/|\.py,|\.cpython)", files)):
             found.setdefault(name, []).append(distribution.metadata["Name"])
     return found
 

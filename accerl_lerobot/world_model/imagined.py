@@ -187,7 +187,7 @@ class ImaginedEnvironment(Environment):
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         actions = checked_actions(actions, self.spec)
         # Equal episodes in any process, although a model may draw from the global generator.
-        with torch_seeded(noise_seed(self._seed, self._steps)):
+        with torch_seeded(noise_seed(self._seed, self._steps), ()):
             prediction = self._world.step(self._state, actions)
         self._state = prediction.state
         frames = prediction.frames[0].numpy()
